@@ -1,5 +1,6 @@
 """Keys of magnetometers in a site's file."""
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -226,24 +227,24 @@ def magnetometer_entries(sensors: tuple[Magnetometer, ...]) -> dict[str, Any]:
     return {"magnetometers": [{"name": s.name} | _magnetometer_entry(s) for s in sensors]}
 
 
+_UNLESS_USUAL: tuple[tuple[str, str, Callable[[Any], Any]], ...] = (
+    ("coil_kappa_m2", "coil_kappa", float),
+    ("offset_walk_t", "offset_walk", float),
+    ("axes", "axes", list),
+    ("clock_offset_s", "clock_offset", float),
+    ("clock_rate_ppm", "clock_rate", ppm),
+    ("clock_rate_sigma_ppm", "clock_rate_sigma", ppm),
+    ("range_t", "field_range", float),
+    ("ac_coupled", "ac_coupled", bool),
+)
+
+
 def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
     sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
     own = {} if centres is None else {"coil_centres_m": plain(centres)}
-    if magnetometer.coil_kappa != Magnetometer.coil_kappa:
-        own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
-    if magnetometer.offset_walk != Magnetometer.offset_walk:
-        own["offset_walk_t"] = float(magnetometer.offset_walk)
-    own |= {} if magnetometer.axes == Magnetometer.axes else {"axes": list(magnetometer.axes)}
-    if magnetometer.clock_offset != Magnetometer.clock_offset:
-        own["clock_offset_s"] = float(magnetometer.clock_offset)
-    if magnetometer.clock_rate != Magnetometer.clock_rate:
-        own["clock_rate_ppm"] = ppm(magnetometer.clock_rate)
-    if magnetometer.clock_rate_sigma != Magnetometer.clock_rate_sigma:
-        own["clock_rate_sigma_ppm"] = ppm(magnetometer.clock_rate_sigma)
-    if magnetometer.field_range != Magnetometer.field_range:
-        own["range_t"] = float(magnetometer.field_range)
-    if magnetometer.ac_coupled:
-        own["ac_coupled"] = True
+    for key, name, written in _UNLESS_USUAL:
+        value = getattr(magnetometer, name)
+        own |= {} if value == getattr(Magnetometer, name) else {key: written(value)}
     clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
     return (
         own

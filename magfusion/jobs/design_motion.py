@@ -10,7 +10,7 @@ from magfusion.jobs.design_settings import DesignSettings
 from magfusion.model.hall import Hall
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust
-from magfusion.results.design.motion import MotionPlan, Stop, next_motion
+from magfusion.results.design.motion import MotionPlan, next_motion
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
@@ -95,10 +95,6 @@ def _write_stops(path: Path, result: MotionPlan) -> None:
         zip(("position_x", "position_y", "position_z"), where.T, strict=True)
     )
     columns |= dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), rotated.T, strict=True))
-    columns["parameter"] = [_name(result, stop) for stop in result.stops]
+    columns["parameter"] = [parameters.names[stop.worst][0] for stop in result.stops]
     columns |= {"sigma_before": size * column("before"), "sigma_after": size * column("after")}
     write_table(columns, path)
-
-
-def _name(result: MotionPlan, stop: Stop) -> str:
-    return result.parameters.names[stop.worst][0]

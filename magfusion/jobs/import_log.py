@@ -337,14 +337,11 @@ def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path 
             file = str(directory / f"{stream}.parquet")
             if file in sentence:
                 # The remedy in the message of a log's reader is to change the numbers.
-                fact = sentence.rpartition(";")[0].replace(file, _place(plan))
+                place = f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
+                fact = sentence.rpartition(";")[0].replace(file, place)
                 sentence = f"{fact}; correct the units in --map."
         raise InputError(sentence.replace(str(directory), str(output))) from error
     return Figures(*(f for f in figures.all if f.section is not Section.TITLE))
-
-
-def _place(plan: ImportPlan) -> str:
-    return f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
 
 
 COMMAND = Command(

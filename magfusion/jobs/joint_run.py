@@ -110,7 +110,7 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> tuple[list[str
         path, site = job.declared_path, read_site(job)
         digest = run_key("site", site)  # with its maps, whatever their files are named
         if digest not in digests:
-            other = [key for key in changed_keys(first, site) if not _of_platform(key)]
+            other = [k for k in changed_keys(first, site) if k.split(".")[0] != "platform"]
             if other:
                 raise InputError(
                     f"{path}: {other[0]} differs from {jobs[0].declared_path}; logs that refine one"
@@ -126,10 +126,6 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> tuple[list[str
             " tight and --estimate as they are, or smooth each log on its own"
         )
     return [*digests], platforms
-
-
-def _of_platform(key: str) -> bool:
-    return key.split(".")[0] == "platform"
 
 
 def site_files(tasks: Sequence[LogTask]) -> SiteFiles:

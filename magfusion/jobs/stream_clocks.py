@@ -213,7 +213,8 @@ class OlderRecords:
 
     def _contains(self, record: Record | None) -> bool:
         """Return whether a record is one of them; the first newer one ends them."""
-        newest = -np.inf if record is None else max(_newest_stamps(record), default=-np.inf)
+        streams = () if record is None else _streams(record)
+        newest = max((float(np.max(times)) for _, times in streams), default=-np.inf)
         if newest >= self._until:
             self._until = -np.inf
         older = -np.inf < newest < self._until
@@ -229,10 +230,6 @@ class OlderRecords:
         """Write how many there were."""
         if self.count:
             write_message(messages, f"{self.count} records before the checkpoint are not used")
-
-
-def _newest_stamps(record: Record) -> Iterator[float]:
-    return (float(np.max(times)) for _, times in _streams(record))
 
 
 def _streams(record: Record) -> Iterator[tuple[str, Array]]:

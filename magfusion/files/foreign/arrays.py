@@ -257,7 +257,7 @@ def _parquet(path: Path) -> Source:
                 column = batch.column(batch.schema.get_field_index(schema.names[k]))
                 stays = k in texts and not pa.types.is_floating(column.type)
                 if stays and pa.types.is_integer(column.type):
-                    columns.append(_integers(column))
+                    columns.append(column.cast(pa.int64()).to_numpy(zero_copy_only=False))
                 elif stays:
                     columns.append(column)
                 else:
@@ -270,7 +270,3 @@ def _parquet(path: Path) -> Source:
         for field in schema
     )
     return Source(str(path), columns, read)
-
-
-def _integers(column: pa.Array) -> AnyArray:
-    return np.asarray(column.cast(pa.int64()).to_numpy(zero_copy_only=False))
