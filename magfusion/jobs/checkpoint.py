@@ -62,7 +62,7 @@ def begin(
         Of the checkpoint; None for no checkpoint.
     key : str
         Of the run.
-    `extra` : object
+    extra : object
         Other state of a new run; that in the checkpoint has the same type.
     resume : bool
         If false, the run starts from the beginning, and an existing checkpoint is overwritten.

@@ -58,14 +58,12 @@ class WorldTask:
 
     Parameters
     ----------
-    estimator : {'ekf', 'smoother'}
-    drive : {'current', 'voltage'}
     phase_known : bool
         Whether the drives are declared synchronised; otherwise each beacon has a clock of its own.
-    Relative error of the clock common to all drives.
+    clock_rate : float
         Relative error of the clock that all drives share.
-    Directory of the files needed to resume; None stores nothing.
-        Directory of what is needed to go on; None keeps nothing.
+    place : str, optional
+        Directory of the files needed to resume; None stores nothing.
     """
 
     world: int

@@ -164,11 +164,11 @@ def read_job(
         Whether it accepts several magnetometers.
     raw : bool
         Whether it demodulates the samples of several itself.
-    `reread` : bool
+    reread : bool
         Whether it demodulates them again, once the motion is known.
     lockin : LockinSettings, optional
         Demodulation settings for the samples of several magnetometers.
-    `select_beacons` : bool
+    select_beacons : bool
         Whether only the beacons detected in a window are used, of many.
     """
     site = read_site(job, unknown=unknown, without=without, several=several)

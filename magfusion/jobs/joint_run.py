@@ -247,7 +247,7 @@ def trust_of_all(
     ----------
     table : list of dict
         A row for each log.
-    `undetected` : list of str
+    undetected : list of str
         Beacons that are detected in no log.
     moved : float
         Change of the shared calibration in the last round, in sigmas.

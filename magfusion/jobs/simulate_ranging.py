@@ -108,7 +108,7 @@ def simulate_ranging(
         As `is_for_ranging`.
     rate_hz : float, optional
         Of the magnetometer.
-    `neighbour` : tuple of Pipe
+    neighbour : tuple of Pipe
         Steel near the wells.
     """
     from magfusion.jobs.result_directory import claim

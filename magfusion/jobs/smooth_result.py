@@ -116,7 +116,7 @@ def finished(
     ----------
     excess : float
         Factor on the variances of its poses, from other logs.
-    `findings` : tuple of Finding
+    findings : tuple of Finding
         From other logs.
     correction : Correction, optional
         By which the site was corrected: it is the reason why the result is doubtful.

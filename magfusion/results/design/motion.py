@@ -59,7 +59,7 @@ class Parameters:
         Change of the fields for one sigma, in sigmas of their noise.
     limit : ndarray, shape (k,)
         Relative to the declared sigma, after all possible stops.
-    `requested` : bool ndarray, shape (k,)
+    requested : bool ndarray, shape (k,)
         Whether stops can determine it, and it belongs to the site rather than to one log.
     """
 
