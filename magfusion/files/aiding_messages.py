@@ -48,11 +48,7 @@ _ROWS: Mapping[Quantity, Mapping[str, Row]] = {
         POSE: pose_row,
         POSE_WITH_COVARIANCE: sure_pose_row,
     },
-    "relative_pose": {
-        ODOMETRY: odometry_row,
-        POSE: pose_row,
-        POSE_WITH_COVARIANCE: sure_pose_row,
-    },
+    "relative_pose": {ODOMETRY: odometry_row, POSE: pose_row, POSE_WITH_COVARIANCE: sure_pose_row},
     "range": {"sensor_msgs/msg/Range": lambda message: [message.range]},
     "position": {
         ODOMETRY: components("pose.pose.position.xyz"),

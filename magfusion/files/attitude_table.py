@@ -126,10 +126,7 @@ def write_attitudes(
     determined : bool ndarray, shape (n, hypotheses)
     """
     epoch, rank = np.nonzero(np.isfinite(rpy[..., 0]))
-    columns: dict[str, object] = {
-        TIME: Span(epoch_ns).stamps(time[epoch]),
-        "hypothesis": rank,
-    }
+    columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(time[epoch]), "hypothesis": rank}
     columns |= dict(zip(_RPY, rpy[epoch, rank].T / DEGREE, strict=True))
     names = (name.replace("_deg", "_sigma_deg") for name in _RPY)
     columns |= dict(zip(names, sigma[epoch, rank].T / DEGREE, strict=True))

@@ -50,10 +50,7 @@ def write_hypotheses(
     more = {} if columns is None else columns
     epoch, rank = np.nonzero(np.isfinite(cost))
     rotation = Rotation.from_matrix(world_from_body[epoch, rank])
-    table: dict[str, object] = {
-        TIME: Span(epoch_ns).stamps(time[epoch]),
-        "hypothesis": rank,
-    }
+    table: dict[str, object] = {TIME: Span(epoch_ns).stamps(time[epoch]), "hypothesis": rank}
     table |= dict(
         zip(("position_x", "position_y", "position_z"), position_world[epoch, rank].T, strict=True)
     )

@@ -7,14 +7,7 @@ import numpy as np
 import pyarrow as pa
 
 from magfusion.errors import InputError
-from magfusion.files.plain_table import (
-    POSITION,
-    column,
-    integers,
-    numbers,
-    read_whole,
-    refuse_rows,
-)
+from magfusion.files.plain_table import POSITION, column, integers, numbers, read_whole, refuse_rows
 from magfusion.model.probe import ProbeReadings
 from magfusion.units import Array
 

@@ -41,10 +41,7 @@ from magfusion.files.site_values import (
 )
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
-from magfusion.model.site import (
-    Beacon,
-    Coil,
-)
+from magfusion.model.site import Beacon, Coil
 from magfusion.units import DEGREE, Array
 
 _Length = Annotated[AboveZero, between(1e-5, 1e3)]

@@ -6,15 +6,7 @@ from itertools import permutations
 
 from magfusion.errors import InputError
 
-KEYS = (
-    "position_m",
-    "rpy_deg",
-    "frequency_hz",
-    "moment_a_m2",
-    "axes",
-    "radius_m",
-    "synchronised",
-)
+KEYS = ("position_m", "rpy_deg", "frequency_hz", "moment_a_m2", "axes", "radius_m", "synchronised")
 EXAMPLE = "'A position_m=0,0,1 rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy'"
 _TRUTHS = {"yes": True, "true": True, "no": False, "false": False}
 # Of one coil, two or three, each with an axis of its own.

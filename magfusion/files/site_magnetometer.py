@@ -86,9 +86,7 @@ class MagnetometerEntry(StrictModel):
 
     body_from_sensor: MountingEntry = Field(default_factory=MountingEntry)
     noise_density_t_rthz: Annotated[
-        AboveZero,
-        tesla(LARGEST_NOISE_DENSITY, "T/sqrt(Hz)"),
-        between(1e-18, LARGEST_NOISE_DENSITY),
+        AboveZero, tesla(LARGEST_NOISE_DENSITY, "T/sqrt(Hz)"), between(1e-18, LARGEST_NOISE_DENSITY)
     ]
     matrix: Annotated[Array, array(3, 3, largest=LARGEST_SCALE), AfterValidator(not_singular)] = (
         Field(default_factory=lambda: np.eye(3))

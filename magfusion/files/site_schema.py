@@ -3,26 +3,12 @@
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    Field,
-    PlainValidator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from magfusion.files.site_aiding import AidingEntry
 from magfusion.files.site_beacon import BeaconEntry
-from magfusion.files.site_magnetometer import (
-    MagnetometerEntry,
-    check_magnetometers,
-    check_tones,
-)
-from magfusion.files.site_motion import (
-    ImuEntry,
-    ImuIntrinsicsEntry,
-    MotionEntry,
-    MotionPriorEntry,
-)
+from magfusion.files.site_magnetometer import MagnetometerEntry, check_magnetometers, check_tones
+from magfusion.files.site_motion import ImuEntry, ImuIntrinsicsEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_values import (
     LARGEST_CONDUCTIVITY,
@@ -43,11 +29,7 @@ from magfusion.files.site_values import (
     tesla,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.site import (
-    ClockModel,
-    EarthModel,
-    Site,
-)
+from magfusion.model.site import ClockModel, EarthModel, Site
 from magfusion.units import DEGREE, Array
 
 _CLOCK, _EARTH = ClockModel(), EarthModel()

@@ -12,14 +12,7 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
-from magfusion.files.plain_table import (
-    POSITION,
-    column,
-    integers,
-    numbers,
-    read_whole,
-    refuse_rows,
-)
+from magfusion.files.plain_table import POSITION, column, integers, numbers, read_whole, refuse_rows
 from magfusion.model.steel_field import SteelField
 from magfusion.units import AnyArray, Array
 

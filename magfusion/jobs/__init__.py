@@ -2,22 +2,13 @@
 
 # Path of each command, in listing order: the module of its job, and a description.
 JOBS = {
-    "smooth": (
-        "smooth",
-        "Smooth a log: trajectory and calibration in one solution.",
-    ),
-    "fix": (
-        "fix",
-        "Fix the pose at every epoch on its own, with every remaining hypothesis.",
-    ),
+    "smooth": ("smooth", "Smooth a log: trajectory and calibration in one solution."),
+    "fix": ("fix", "Fix the pose at every epoch on its own, with every remaining hypothesis."),
     "import": (
         "import_log",
         "Import tables of any names and units, a bag, a EuRoC folder or a flight log.",
     ),
-    "check": (
-        "check",
-        "Check a log in seconds: consistency of streams, fields and first fixes.",
-    ),
+    "check": ("check", "Check a log in seconds: consistency of streams, fields and first fixes."),
     "init": (
         "init",
         "Write a commented site file: from options, the tones of a recording, or questions.",
@@ -34,10 +25,7 @@ JOBS = {
         "evaluate",
         "Compare a trajectory with a truth: ATE, RPE and attitude, absolute and aligned.",
     ),
-    "export": (
-        "export",
-        "Export a result as a ROS 2 bag (MCAP, db3), TUM, KITTI or CSV.",
-    ),
+    "export": ("export", "Export a result as a ROS 2 bag (MCAP, db3), TUM, KITTI or CSV."),
     "view": ("view", "Open the recording of a result in the rerun viewer."),
     "demo": (
         "demo",

@@ -10,11 +10,7 @@ from magfusion.calibration.allan_fit import MISFIT, AllanFit, fit_allan
 from magfusion.calibration.rest import QUANTISED, RestStream
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.pauses import repeated_samples
-from magfusion.estimation.data_checks.samples import (
-    clipped_samples,
-    false_samples,
-    frozen_samples,
-)
+from magfusion.estimation.data_checks.samples import clipped_samples, false_samples, frozen_samples
 from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.jobs.inputs import Job

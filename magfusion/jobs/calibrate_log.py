@@ -100,11 +100,7 @@ def run_calibrate_log(
     from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
-    from magfusion.results.report import (
-        compared_with_truth,
-        placement_figures,
-        smoothed_figures,
-    )
+    from magfusion.results.report import compared_with_truth, placement_figures, smoothed_figures
 
     job = settings.job(output)
     smoother = SmootherSettings(estimate=settings.groups, lockin=settings.lockin(job))

@@ -52,11 +52,7 @@ class MagnetometerSettings(LogSettings):
     positions: bool = option(False, "Use only the stops of the log: twelve or more")
     form: Literal["json", "msgpack"] = option("json", "Records in the pipe", name="format")
     offset_sigma: float = option(
-        0.1,
-        "Offset sigma at which a guided rotation ends",
-        unit="uT",
-        least=1e-3,
-        most=10.0,
+        0.1, "Offset sigma at which a guided rotation ends", unit="uT", least=1e-3, most=10.0
     )
     live: bool = option(False, "Show the guidance in the viewer")
 

@@ -164,8 +164,5 @@ def _gravity_and_field_figures(look: Look) -> Figures:
 
 
 COMMAND = Command(
-    CheckSettings,
-    run_check,
-    output_optional=True,
-    example="magfusion check log --site site.yaml",
+    CheckSettings, run_check, output_optional=True, example="magfusion check log --site site.yaml"
 )

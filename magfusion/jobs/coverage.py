@@ -37,9 +37,7 @@ class CoverageSettings(NeedSettings):
 
     site: Path = argument("Site file of the installation")
     box: str | None = option(
-        None,
-        "Volume, m: xmin,xmax,ymin,ymax,zmin,zmax",
-        note="default: around the beacons",
+        None, "Volume, m: xmin,xmax,ymin,ymax,zmin,zmax", note="default: around the beacons"
     )
     height: float | None = option(None, "A single height", unit="m")
     spacing: float | None = option(
@@ -117,11 +115,7 @@ def _spacing(box: Array, settings: CoverageSettings) -> float:
 
 
 def _figures(
-    site: Site,
-    window: float,
-    spacing: float,
-    coverage: Coverage,
-    extra: ExtraBeacon | None,
+    site: Site, window: float, spacing: float, coverage: Coverage, extra: ExtraBeacon | None
 ) -> Figures:
     position, attitude = coverage.position_quantile, coverage.attitude_quantile
     figures = [

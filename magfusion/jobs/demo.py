@@ -50,9 +50,5 @@ def _show(settings: DemoSettings, output: Path) -> None:
 
 
 COMMAND = Command(
-    DemoSettings,
-    run_demo,
-    output="magfusion_demo",
-    after=_show,
-    example="magfusion demo",
+    DemoSettings, run_demo, output="magfusion_demo", after=_show, example="magfusion demo"
 )

@@ -23,12 +23,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import coverage, usual_box
 from magfusion.results.design.coil_drive import drive_figures
-from magfusion.results.design.need import (
-    NeededDesign,
-    least_moment,
-    min_beacons,
-    most_beacons,
-)
+from magfusion.results.design.need import NeededDesign, least_moment, min_beacons, most_beacons
 from magfusion.results.design.pattern import ToneBand, template_of
 from magfusion.results.design.planning import Design, Task, designed, with_moment
 from magfusion.results.design.turns import cycle_of, is_in_turn

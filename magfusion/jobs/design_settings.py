@@ -111,11 +111,7 @@ class DesignSettings(NeedSettings, DriveSettings, RandomSettings):
     )
     band: str = option("10,100", "Frequency band of tones, Hz: low,high")
     window: float = option(
-        0.4,
-        "Time over which tones are averaged and separated",
-        unit="s",
-        least=0.02,
-        most=4.0,
+        0.4, "Time over which tones are averaged and separated", unit="s", least=0.02, most=4.0
     )
     mains_hz: float = option(
         50.0, "Mains (harmonics are avoided)", unit="Hz", least=0.0, most=1e3, note="0: none"

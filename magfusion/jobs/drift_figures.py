@@ -236,9 +236,7 @@ def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
         mean = float(np.mean(np.concatenate(level)))
         begin, end = settled_after(runs[0].task.hours), 3600.0 * runs[0].task.hours
         halves = in_windows(
-            np.concatenate(time),
-            np.concatenate(level),
-            np.array([begin, 0.5 * (begin + end), end]),
+            np.concatenate(time), np.concatenate(level), np.array([begin, 0.5 * (begin + end), end])
         ).tolist()
         figures += [
             Figure(f"{name}_nees_per_dof", mean),

@@ -154,9 +154,7 @@ def declared_site(drive: str, phase_known: bool) -> Site:
 def draw_task(task: WorldTask) -> EnduranceWorld:
     """Return the world of a task; it is the same for both estimators."""
     config = EnduranceConfig(
-        hours=task.hours,
-        drift=usual_drift(task.drive, task.clock_rate),
-        instability=INSTABILITY,
+        hours=task.hours, drift=usual_drift(task.drive, task.clock_rate), instability=INSTABILITY
     )
     site = declared_site(task.drive, task.phase_known)
     return draw_endurance(site, config, (task.seed, task.world))

@@ -76,9 +76,7 @@ class ImportSettings(Settings):
         metavar="TABLE=HZ[@SECONDS]",
     )
     offset: tuple[str, ...] = option(
-        (),
-        "Offset added to the times of a table from another clock",
-        metavar="TABLE=SECONDS",
+        (), "Offset added to the times of a table from another clock", metavar="TABLE=SECONDS"
     )
     rows: tuple[str, ...] = option(
         (),
@@ -303,11 +301,7 @@ def _recorded(path: Path, audio: AudioEntry) -> Counts:
 
 
 def _write_header(
-    directory: Path,
-    output: Path,
-    result: GatheredStreams,
-    epoch_ns: int,
-    audio: AudioEntry | None,
+    directory: Path, output: Path, result: GatheredStreams, epoch_ns: int, audio: AudioEntry | None
 ) -> None:
     places = [plan.source.place for plan in result.every]
     places += [] if audio is None else [audio.file]

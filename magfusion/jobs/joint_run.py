@@ -13,9 +13,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.batch.calendar import Calendar
 from magfusion.estimation.batch.change_between_logs import FoundChange
-from magfusion.estimation.batch.joint import (
-    SharedCalibration,
-)
+from magfusion.estimation.batch.joint import SharedCalibration
 from magfusion.estimation.integrity.logs_agree import LogAgreement
 from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.atomic import real
@@ -23,21 +21,9 @@ from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.inputs import Job, read_job, read_site
-from magfusion.jobs.joint_calendar import (
-    ChangeReport,
-    check_dates,
-    describe_change,
-)
+from magfusion.jobs.joint_calendar import ChangeReport, check_dates, describe_change
 from magfusion.jobs.joint_driver import MOST_ROUNDS, Driver
-from magfusion.jobs.joint_tasks import (
-    Alone,
-    LastTask,
-    LogTask,
-    SiteFiles,
-    alone,
-    last,
-    shared_of,
-)
+from magfusion.jobs.joint_tasks import Alone, LastTask, LogTask, SiteFiles, alone, last, shared_of
 from magfusion.jobs.written import KEPT, SITE_FILES
 from magfusion.model.progress import Report
 from magfusion.model.site import Site

@@ -307,7 +307,5 @@ def _save(run: NavigateRun, position: int, elapsed: float) -> None:
 
 
 COMMAND = Command(
-    NavigateSettings,
-    run,
-    example="magfusion navigate log --estimator ekf -o navigated",
+    NavigateSettings, run, example="magfusion navigate log --estimator ekf -o navigated"
 )

@@ -69,10 +69,7 @@ def run_published_fix(
     valid = attitude_is_valid(axis_world, stamps, log.imu)
     result = _poses(fixes, stamps, site, valid)
     trust = Trust(
-        (
-            *_findings(method, valid, axis_spread(axis_world)),
-            *recorded(log, site, BRIDGED_CODES),
-        )
+        (*_findings(method, valid, axis_spread(axis_world)), *recorded(log, site, BRIDGED_CODES))
     )
     errors, compared = compared_with_truth(result, log) if len(result) else (None, Figures())
     figures = (

@@ -17,10 +17,7 @@ class RestSettings(Settings):
         False, "Make one epoch of each rest, of any length, for beacons far below the noise"
     )
     false_alarm: float = option(
-        1e-3,
-        "With --at-rest: false-alarm probability per rest and beacon",
-        least=1e-9,
-        most=0.1,
+        1e-3, "With --at-rest: false-alarm probability per rest and beacon", least=1e-9, most=0.1
     )
 
     def integrated(

@@ -65,9 +65,7 @@ class SimulateSettings(ShaftSettings):
     perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
     iron: int = option(0, "Steel spheres around the room, at least 0.5 m away", least=0, most=200)
     ambient: Literal["quiet", "day-night"] = option(
-        "quiet",
-        "White ambient noise",
-        note="day-night: 0.2 nT/sqrt(Hz) at night, 0.4 at 14:00 UTC",
+        "quiet", "White ambient noise", note="day-night: 0.2 nT/sqrt(Hz) at night, 0.4 at 14:00 UTC"
     )
     drift: float = option(
         0.0,
@@ -273,11 +271,7 @@ def _refuse_wells(settings: SimulateSettings, site: Site) -> None:
 
 
 def run_simulate(
-    site: Site,
-    config: SimulationConfig,
-    output: Path,
-    seed: int,
-    full_scale_v: float | None = None,
+    site: Site, config: SimulationConfig, output: Path, seed: int, full_scale_v: float | None = None
 ) -> Figures:
     """Simulate a log, with truth.
 

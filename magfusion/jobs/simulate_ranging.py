@@ -67,10 +67,7 @@ class ShaftSettings(RandomSettings):
     def shaft_errors(self) -> ShaftErrors:
         """Return the errors of shafts."""
         return ShaftErrors(
-            self.shaft_drift,
-            self.shaft_whirl * DEGREE,
-            self.encoder,
-            self.encoder_sigma * DEGREE,
+            self.shaft_drift, self.shaft_whirl * DEGREE, self.encoder, self.encoder_sigma * DEGREE
         )
 
 

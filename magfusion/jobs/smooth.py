@@ -362,8 +362,4 @@ def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Si
         return with_found_gain(fields, site)
 
 
-COMMAND = Command(
-    SmoothSettings,
-    run,
-    example="magfusion smooth log --site site.yaml -o run",
-)
+COMMAND = Command(SmoothSettings, run, example="magfusion smooth log --site site.yaml -o run")

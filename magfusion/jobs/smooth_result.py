@@ -8,12 +8,7 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
 from magfusion.estimation.integrity.change_detection import changed_beacon
-from magfusion.estimation.integrity.correction import (
-    Correction,
-    continued,
-    corrections,
-    spread_of,
-)
+from magfusion.estimation.integrity.correction import Correction, continued, corrections, spread_of
 from magfusion.estimation.integrity.diagnosis import (
     diagnosed,
     with_changed_beacons,

@@ -37,9 +37,7 @@ class SurveySettings(LogSettings, WindowSettings):
     """Selection of survey points; of points too close to each other, the first."""
 
     trajectory: Path | None = option(
-        None,
-        "Result, TUM file or table with the poses",
-        note="default: the log's truth",
+        None, "Result, TUM file or table with the poses", note="default: the log's truth"
     )
     points: Points = option("rests", "One point a stop, or one an epoch")
     spacing: float = option(0.0, "Minimum distance of two points", unit="m", least=0.0)
@@ -264,7 +262,5 @@ def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> F
 
 
 COMMAND = Command(
-    SurveySettings,
-    run_survey,
-    example="magfusion survey log --points epochs -o survey",
+    SurveySettings, run_survey, example="magfusion survey log --points epochs -o survey"
 )

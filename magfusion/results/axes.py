@@ -16,14 +16,7 @@ from magfusion.results.gauge import frame_directions
 from magfusion.units import Array
 
 # Axes of a row, with their units; rotations are about axes of the world.
-AXES = (
-    ("x", "m"),
-    ("y", "m"),
-    ("z", "m"),
-    ("rot_x", "deg"),
-    ("rot_y", "deg"),
-    ("yaw", "deg"),
-)
+AXES = (("x", "m"), ("y", "m"), ("z", "m"), ("rot_x", "deg"), ("rot_y", "deg"), ("yaw", "deg"))
 ROWS = {
     "error": "error",
     "sigma": "sigma",

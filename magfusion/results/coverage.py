@@ -220,10 +220,7 @@ def _of_window(
 
 
 def best_extra_beacon(
-    site: Site,
-    box_world: Array,
-    bound: Callable[[Site, Array], Coverage],
-    position_world: Array,
+    site: Site, box_world: Array, bound: Callable[[Site, Array], Coverage], position_world: Array
 ) -> ExtraBeacon:
     """Find the best position of one more beacon of the first's kind, on the boundary of a box.
 

@@ -39,13 +39,9 @@ def array_source(path: Path) -> Source:
 
     Raises InputError where it cannot be read or holds no numbers.
     """
-    opened = {
-        ".npy": _npy,
-        ".npz": _npz,
-        ".wav": _wav,
-        ".mat": _mat,
-        ".parquet": _parquet,
-    }.get(path.suffix.lower(), _hdf5)
+    opened = {".npy": _npy, ".npz": _npz, ".wav": _wav, ".mat": _mat, ".parquet": _parquet}.get(
+        path.suffix.lower(), _hdf5
+    )
     try:
         source = opened(path)
     except InputError:

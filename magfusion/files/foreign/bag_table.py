@@ -25,15 +25,8 @@ from magfusion.files.foreign.guess_by_values import likely_unit
 from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
-from magfusion.files.messages import (
-    ODOMETRY,
-    USUAL,
-    components,
-    stamp_ns,
-)
-from magfusion.files.messages import (
-    ROWS as ROW_OF,
-)
+from magfusion.files.messages import ODOMETRY, USUAL, components, stamp_ns
+from magfusion.files.messages import ROWS as ROW_OF
 from magfusion.units import Array, IntArray
 
 _POSE = ("position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")

@@ -17,12 +17,7 @@ from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.row_stamps import batches_text, separate_stamps
-from magfusion.files.stray_stamps import (
-    LONGEST_GAP,
-    MOST_STRAY,
-    MOST_STRAY_ROWS,
-    stray_rows,
-)
+from magfusion.files.stray_stamps import LONGEST_GAP, MOST_STRAY, MOST_STRAY_ROWS, stray_rows
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.model.counters import lost_by_wrapping
@@ -310,11 +305,7 @@ def _order(path: Path, counts: Counts, stream: str) -> None:
         counts.missing -= int(np.sum(twice & absent))
         table = table.filter(pa.array(~twice))
     pa.parquet.write_table(
-        table,
-        path,
-        compression="zstd",
-        row_group_size=ROWS_PER_GROUP,
-        write_page_checksum=True,
+        table, path, compression="zstd", row_group_size=ROWS_PER_GROUP, write_page_checksum=True
     )
 
 

@@ -76,10 +76,7 @@ FLIGHTS = {
         "ArduPilot DataFlash log",
         read_dataflash,
         {
-            "IMU": (
-                "imu.gyro=GyrX,-GyrY,-GyrZ[rad/s]",
-                "imu.accel=AccX,-AccY,-AccZ[m/s^2]",
-            ),
+            "IMU": ("imu.gyro=GyrX,-GyrY,-GyrZ[rad/s]", "imu.accel=AccX,-AccY,-AccZ[m/s^2]"),
             "MAG": ("magnetometer.field=MagX,-MagY,-MagZ[mG]",),
             **dict.fromkeys(
                 ("XKF1", "NKF1", "ATT"),

@@ -6,11 +6,7 @@ from dataclasses import dataclass
 
 from magfusion.files.foreign.columns import EULER, QUATERNION, STREAMS, TIME, Term
 from magfusion.files.foreign.source import SourceColumn
-from magfusion.files.foreign.units import (
-    Dimension,
-    SourceUnit,
-    parse_unit,
-)
+from magfusion.files.foreign.units import Dimension, SourceUnit, parse_unit
 
 # Names without their axis; the short ones only where nothing else is in the name.
 _STEMS = {

@@ -30,13 +30,7 @@ from magfusion.files.foreign.guess import (
 )
 from magfusion.files.foreign.guess_by_values import by_place, likely_time_unit, likely_unit
 from magfusion.files.foreign.source import Source
-from magfusion.files.foreign.units import (
-    ISO,
-    Dimension,
-    Raw,
-    SourceUnit,
-    is_date,
-)
+from magfusion.files.foreign.units import ISO, Dimension, Raw, SourceUnit, is_date
 from magfusion.units import Array
 
 Terms = dict[str, tuple[Term, ...]]

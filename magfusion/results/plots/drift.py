@@ -9,13 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from magfusion.calibration.allan import AllanStream
-from magfusion.results.drift import (
-    QUANTITIES,
-    EstimatorPlot,
-    Quantity,
-    in_windows,
-    worlds_text,
-)
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, Quantity, in_windows, worlds_text
 from magfusion.units import HOUR
 
 _AXES = ("tab:red", "tab:green", "tab:blue")

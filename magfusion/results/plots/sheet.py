@@ -167,12 +167,7 @@ def _plans(
 
 
 def _plan(
-    site: Site,
-    hall: Hall,
-    marks_world: Mapping[str, Array],
-    box: Array,
-    scale: int,
-    title: str,
+    site: Site, hall: Hall, marks_world: Mapping[str, Array], box: Array, scale: int, title: str
 ) -> Figure:
     """Return a page with a part of the plan, lower and upper corner (2, 2) (m), to scale."""
     figure = Figure(figsize=PAGE)
