@@ -235,7 +235,7 @@ def _sparse(score: Score, sigma: Array, site: Site) -> tuple[Score, Array]:
     Parameters
     ----------
     sigma : ndarray, shape (modes,)
-        Of the amplitudes, with the steel in all voxels alike.
+        Of the amplitudes, with the same variance in all voxels.
     """
     basis, shared = basis_of(score), slice(0, basis_of(score).shared)
     information, gradient = amplitude_evidence(score)
