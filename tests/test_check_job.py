@@ -68,6 +68,16 @@ def test_what_is_in_the_way_is_refused(worked: Worked, tmp_path: Path, refuse: R
     refuse(2, "mine", "check", worked.log, "-o", tmp_path / "mine")
 
 
+@pytest.mark.parametrize("name", ["corrected.yaml", "corrected_steel.parquet"])
+def test_no_file_is_replaced_by_a_corrected_site(
+    name: str, worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    (tmp_path / name).write_text("of the user's")
+    sentence = refuse("check", worked.log, "--correct", tmp_path / "corrected.yaml")
+    assert f"{name}: exists; give --correct another path" in sentence
+    assert (tmp_path / name).read_text() == "of the user's"
+
+
 @pytest.mark.slow
 def test_a_failed_log_exits_with_one_and_says_why_first(
     spoiled: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]

@@ -184,21 +184,25 @@ def save_site(site: Site, path: Path | str) -> None:
     check_arguments("save_site", site=(site, Site))
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
-    others = path.with_name(f"{path.stem}_field_map.parquet")
+    others, fields, correlation = site_tables(path)
     content = site_content(site)
     if maps:
         content["world"]["field_map"] = others.name
         write_field_maps(maps, others)
     steel = {b.name: b.steel for b in site.every_beacon if b.steel is not None}
     if steel:
-        fields = path.with_name(f"{path.stem}_steel.parquet")
         content["world"]["steel"] = fields.name
         write_steel_fields(fields, steel)
     if site.correlation is not None:
-        correlation = path.with_name(f"{path.stem}_correlation.parquet")
         content["correlation"] = correlation.name
         save_correlation(site, correlation)
     write_yaml(content, path)
+
+
+def site_tables(path: Path) -> list[Path]:
+    """Return where maps of fields, a map of steel and a correlation lie beside a site's file."""
+    kinds = "field_map", "steel", "correlation"
+    return [path.with_name(f"{path.stem}_{kind}.parquet") for kind in kinds]
 
 
 def site_content(site: Site) -> dict[str, Any]:

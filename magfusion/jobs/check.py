@@ -41,13 +41,16 @@ def run_check(
     """
     from magfusion.estimation.demodulation.separate_demodulation import by_name, each_recorded
     from magfusion.estimation.integrity.quick_check import quick_check
+    from magfusion.files.site import site_tables
     from magfusion.jobs.inputs import read_recording
     from magfusion.jobs.result_directory import claim, found_in
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
 
-    if settings.correct is not None and settings.correct.exists():
-        raise InputError(f"{settings.correct}: exists; give --correct another path, or remove it")
+    if (new := settings.correct) is not None:
+        taken = next((p for p in (new, *site_tables(new)) if p.exists()), None)
+        if taken is not None:
+            raise InputError(f"{taken}: exists; give --correct another path, or remove it")
     claimed = nullcontext(None) if output is None else claim(output, "check")
     job = settings.job(Path() if output is None else output)
     began = time.perf_counter()
