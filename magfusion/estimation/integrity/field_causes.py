@@ -75,6 +75,8 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
     tried = [(few.of(way.site), way) for way in _ways(known.site)]
     tried.append((replace(few, samples=inverted), Way(*left_handed(), known.site)))
     for one, way in sorted(tried, key=lambda pair: pair[0].chi_square)[:KEPT]:
+        if one.chi_square >= few.chi_square:
+            return  # the nearest corner frequency explains more than none, if there is one
         way = _refined(few, way)
         whole = known.of(way.site)
         if one.samples is inverted:
