@@ -8,7 +8,7 @@ determine of voxels they determine of the modes, so that no other derivatives ar
 """
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy.linalg import cho_solve, eigh, solve_triangular
 
 from magfusion.estimation.measurements.steel import SteelBasis, beacon_fields, unit_moments
 from magfusion.model.site import Site
@@ -29,19 +29,20 @@ def voxel_variances(basis: SteelBasis, information: Array, gradient: Array, sigm
         Of these amplitudes, from which it is sought: all voxels have the same variance.
     """
     by_mode = basis.tensor / np.linalg.norm(basis.tensor[..., 0])  # orthonormal
+    value, vector = eigh(information)
+    root = vector * np.sqrt(np.maximum(value, 0.0))
     common, own = 0.5 * sigma**2, np.full(len(by_mode), 0.5 * sigma**2)
     for _ in range(ROUNDS):
         kept = np.flatnonzero(own > NEGLIGIBLE * np.max(own))
-        tensor = by_mode[kept]
-        flat = tensor.reshape(-1, basis.shared)
-        prior = flat.T @ (np.repeat(own[kept], 6)[:, None] * flat)
-        inner = np.eye(basis.shared) + information @ (common * np.eye(basis.shared) + prior)
-        solved = np.linalg.solve(inner, np.column_stack([information, gradient]))
-        beyond, step = solved[:, :-1], solved[:, -1]
+        flat = by_mode[kept].reshape(-1, basis.shared)
+        prior = common * np.eye(basis.shared) + flat.T @ (np.repeat(own[kept], 6)[:, None] * flat)
+        chol = np.linalg.cholesky(np.eye(basis.shared) + root.T @ prior @ root)
+        step = gradient - root @ cho_solve((chol, True), root.T @ (prior @ gradient))
+        by_root = solve_triangular(chol, root.T, lower=True)
         # Of the gradient by each voxel: its square, over that which these variances make expected.
-        expected = np.sum((flat @ beyond) * flat, axis=1).reshape(-1, 6).sum(axis=1)
-        own[kept] *= np.sum((tensor @ step) ** 2, axis=1) / expected
-        common *= float(step @ step / np.trace(beyond))
+        measured = np.sum((flat @ step).reshape(-1, 6) ** 2, axis=1)
+        own[kept] *= measured / np.sum((flat @ by_root.T).reshape(len(kept), -1) ** 2, axis=1)
+        common *= float(step @ step / np.sum(by_root**2))
     return common + own
 
 
