@@ -200,7 +200,7 @@ def save_site(site: Site, path: Path | str) -> None:
 
 
 def site_tables(path: Path) -> list[Path]:
-    """Return where maps of fields, a map of steel and a correlation lie beside a site's file."""
+    """Return where maps of fields, a map of steel and a correlation lie next to a site's file."""
     kinds = "field_map", "steel", "correlation"
     return [path.with_name(f"{path.stem}_{kind}.parquet") for kind in kinds]
 

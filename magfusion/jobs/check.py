@@ -48,9 +48,9 @@ def run_check(
     from magfusion.results.report import write_report
 
     if (new := settings.correct) is not None:
-        taken = next((p for p in (new, *site_tables(new)) if p.exists()), None)
-        if taken is not None:
-            raise InputError(f"{taken}: exists; give --correct another path, or remove it")
+        present = next((p for p in (new, *site_tables(new)) if p.exists()), None)
+        if present is not None:
+            raise InputError(f"{present}: exists; give --correct another path, or remove it")
     claimed = nullcontext(None) if output is None else claim(output, "check")
     job = settings.job(Path() if output is None else output)
     began = time.perf_counter()
