@@ -24,7 +24,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     with_long_exclusions,
 )
 from magfusion.estimation.integrity.steel_map import SteelMap, map_steel
-from magfusion.estimation.integrity.steel_test import STEEL, steel_explains
+from magfusion.estimation.integrity.steel_test import STEEL, declared_site, steel_explains
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
     roll_findings,
@@ -185,7 +185,7 @@ def _with_map(
         others = tuple(replace(f, verdict=remarked) if f.code in OF_STEEL else f for f in others)
     elif len(others) == len(trust.findings):  # no reason, so that none is added
         return result, trust, steel
-    trust = Trust((steel.finding(before.declared.site), *others), trust.unverified)
+    trust = Trust((steel.finding(declared_site(before)), *others), trust.unverified)
     return replace(result, trust=trust), trust, steel
 
 

@@ -26,6 +26,7 @@ from magfusion.estimation.measurements.steel import (
     region_modes,
     steel_modes,
 )
+from magfusion.estimation.posterior.noise_tuning import as_declared, tuned_site
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.samples import Log
@@ -124,8 +125,18 @@ def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | No
         estimate = steel_of_score(case.in_region, rival)
     if estimate is None:
         return None
-    finding = estimate.finding(case.result.declared.site)
+    finding = estimate.finding(declared_site(case.result))
     return TestResult((finding,), spread=estimate.spread, gain=estimate.gain)
+
+
+def declared_site(result: Smoothed) -> Site:
+    """Return the site without the noise that was estimated for its beacons."""
+    site = tuned_site(result.declared.site, as_declared(result.noise))
+    beacons = (
+        replace(beacon, model_error=None) if beacon.model_error == site.model_error else beacon
+        for beacon in site.beacons
+    )
+    return replace(site, beacons=tuple(beacons))
 
 
 def _best_parameter(case: Case) -> float:
