@@ -76,7 +76,7 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
     tried.append((replace(few, samples=inverted), Way(*left_handed(), known.site)))
     for one, way in sorted(tried, key=lambda pair: pair[0].chi_square)[:KEPT]:
         if one.chi_square >= few.chi_square:
-            return  # the nearest corner frequency explains more than none, if there is one
+            return  # even at the nearest size tried, a true mistake explains more than none
         way = _refined(few, way)
         whole = known.of(way.site)
         if one.samples is inverted:

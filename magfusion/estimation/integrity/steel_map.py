@@ -108,13 +108,13 @@ class SteelMap(NamedTuple):
         if self.is_used:
             text += (
                 " Its map corrects the poses: made without a beacon, it predicts its fields with"
-                f" {percent:.0f} % of the error without a map."
+                f" {percent:.3g} % of the error without a map."
             )
             return Finding(STEEL, text, Verdict.TRUSTWORTHY, self.steel.weight)
         known = self.steel.finding(site, mapped=True)
         text = (
             " Its map is not used: made without a beacon, it predicts its fields with"
-            f" {percent:.0f} % of the error without a map."
+            f" {percent:.3g} % of the error without a map."
         )
         return replace(known, text=known.text + text)
 
@@ -238,13 +238,12 @@ def _sparse(score: Score, sigma: Array, site: Site) -> tuple[Score, Array]:
         Of the amplitudes, with the same variance in all voxels.
     """
     basis, shared = basis_of(score), slice(0, basis_of(score).shared)
-    information, gradient = amplitude_evidence(score)
-    # Of the shared amplitudes, with those of each tone as uncertain as they are.
-    across, own = information[shared, shared.stop :], information[shared.stop :, shared.stop :]
-    inner = own + np.diag(sigma[shared.stop :] ** -2)
-    by = across @ np.linalg.solve(inner, np.column_stack([across.T, gradient[shared.stop :]]))
-    information, gradient = information[shared, shared] - by[:, :-1], gradient[shared] - by[:, -1]
-    variance = voxel_variances(basis, information, gradient, max(float(sigma[0]), LEAST_SIZE))
+    size, own = len(score.gradient), len(sigma) - shared.stop
+    spread = np.eye(size)[:, size - own :] * sigma[shared.stop :]  # of each tone's own moments
+    alone = replace(score, spread=np.concatenate([score.spread, spread], axis=1))
+    information, gradient = amplitude_evidence(alone)
+    evidence = information[shared, shared], gradient[shared]
+    variance = voxel_variances(basis, *evidence, max(float(sigma[0]), LEAST_SIZE))
     few = _with_basis(score, *with_variances(basis, site, variance))
     is_shared = np.arange(len(block_of(few).sigma)) < basis_of(few).shared
     return few, best_size(*amplitude_evidence(few), is_shared)[1]

@@ -254,12 +254,10 @@ def _region_basis(site: Site) -> SteelBasis | None:
     # An eigenvector's sign is arbitrary, and a checkpoint may be resumed elsewhere.
     moment = basis.moment.real.reshape(-1, basis.moment.shape[-1])
     sign = np.where(np.cos(np.arange(len(moment))) @ moment < 0.0, -1.0, 1.0)
-    return SteelBasis(
-        voxels,
-        sign * basis.moment,
-        sign * basis.polarisability,
-        sign[: basis.shared] * basis.tensor,
-        SOFTENING,
+    return basis._replace(
+        moment=sign * basis.moment,
+        polarisability=sign * basis.polarisability,
+        tensor=sign[: basis.shared] * basis.tensor,
     )
 
 
