@@ -28,7 +28,7 @@ def voxel_variances(basis: SteelBasis, information: Array, gradient: Array, sigm
     sigma : float
         Of these amplitudes, from which it is sought: all voxels have the same variance.
     """
-    by_mode = basis.tensor / np.linalg.norm(basis.tensor[..., 0])  # orthonormal
+    by_mode = basis.tensor / basis.unit
     value, vector = eigh(information)
     root = vector * np.sqrt(np.maximum(value, 0.0))
     common, own = 0.5 * sigma**2, np.full(len(by_mode), 0.5 * sigma**2)
@@ -61,12 +61,12 @@ def with_variances(basis: SteelBasis, site: Site, variance: Array) -> tuple[Stee
     old_by_new : ndarray, shape (shared, fewer)
         Amplitudes of the shared modes by a unit of each.
     """
-    unit = np.linalg.norm(basis.tensor[..., 0])
-    of_all = variance[:, None, None] * basis.tensor / unit
-    value, vector = eigh(np.tensordot(basis.tensor / unit, of_all, axes=((0, 1), (0, 1))))
+    by_mode = basis.tensor / basis.unit
+    of_all = variance[:, None, None] * by_mode
+    value, vector = eigh(np.tensordot(by_mode, of_all, axes=((0, 1), (0, 1))))
     known = value > NEGLIGIBLE * value[-1]
     strength, vector = np.sqrt(value[known]), vector[:, known]
-    tensor = unit * of_all @ (vector / strength)
+    tensor = basis.unit * of_all @ (vector / strength)
     at_voxels = beacon_fields(site, basis.voxels.centre_world)
     shared = unit_moments(basis.voxels, at_voxels) @ tensor[:, None]
     moment = np.concatenate([shared, basis.moment[..., basis.shared :]], axis=-1)

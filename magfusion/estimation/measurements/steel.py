@@ -93,6 +93,11 @@ class SteelBasis(NamedTuple):
         """Number of shared modes."""
         return int(self.tensor.shape[-1])
 
+    @property
+    def unit(self) -> float:
+        """Norm of each column of ``tensor``; they are orthogonal."""
+        return float(np.linalg.norm(self.tensor[..., 0]))
+
     def fields(self, place_world: Array) -> AnyArray:
         """Return the field of a unit of each at places, world axes (T), (n, tones, 3, modes)."""
         moment, softening = self.moment, self.softening * self.voxels.edge
