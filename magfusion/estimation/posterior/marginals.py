@@ -27,7 +27,8 @@ from magfusion.units import Array
 
 POSE = 6
 CHECKED_POSES = 5  # poses at which the tree is used too
-AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
+# Of a variance, a thousandth of a sigma.  Without fields for minutes the tree's own rounding is 2e-4.
+AGREED = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
