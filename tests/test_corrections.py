@@ -79,6 +79,15 @@ def test_a_mistake_is_undone_and_its_remedy_works(
 
     for key, value in first["remedy"].items():
         set_key(site, key, value)
+    if code == "lever_arm":  # estimated in the same solution, with what it does not know
+        right = yaml.safe_load((log / "site.yaml").read_text(encoding="utf-8"))
+        here, there = (
+            np.array(one["platform"]["magnetometer"]["body_from_sensor"]["position_m"])
+            for one in (site, right)
+        )
+        sigma = np.array(first["remedy"]["platform.magnetometer.sigma.position_m"])
+        assert np.all(np.abs(here - there) < 4.0 * sigma)
+        assert np.all(sigma < 0.005)  # m
     again = smoothed(log, site, tmp_path / "again")
     assert again["verdict"] == "trustworthy"
     assert again["ate_m"] < 0.02  # m

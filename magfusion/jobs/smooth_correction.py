@@ -9,6 +9,7 @@ from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.correction import (
     Correction,
     Trial,
+    as_estimated,
     best_trial,
     corrected_finding,
 )
@@ -52,7 +53,8 @@ def corrected(
             result = smooth(*used, report)
         except (RuntimeError, InputError):
             return None
-        finding = corrected_finding(correction, site, reasons)
+        estimate = result.calibration, result.blocks, result.calibration_cov
+        finding = corrected_finding(as_estimated(correction, site, *estimate), site, reasons)
         trial = correction._replace(finding=finding)
         done = finished(*used, result, risk, findings=findings, correction=trial, mapping=mapping)
         nearly = correction.clear and done.trust.verdict is not Verdict.FAILED

@@ -18,7 +18,7 @@ from magfusion.estimation.integrity.suspects import (
     Suspect,
 )
 from magfusion.model.imu_intrinsics import ImuIntrinsics
-from magfusion.model.parameters import PHASE, Block, Parameter, initial_calibration
+from magfusion.model.parameters import PHASE, Block, Calibration, Parameter, initial_calibration
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
 
@@ -89,6 +89,48 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
         return replace(site, beacons=beacons)
     for block in fault.blocks:
         site = _moved(site, block, block.sigma * step[block.columns])
+    return site
+
+
+def released_blocks(fault: Suspect) -> tuple[Block, ...]:
+    """Return the blocks of a candidate fault if a site can declare their sigmas, of one owner.
+
+    Those of all beacons at once are, in part, the frame of the survey: no log determines it.
+    """
+    blocks = fault.blocks
+    whole = fault.combine.shape[1] == sum(len(block.sigma) for block in blocks)
+    single = len({block.owner for block in blocks}) == 1
+    declarable = all(block.parameter.declared for block in blocks)
+    return blocks if whole and single and declarable and not fault.code else ()
+
+
+def with_wide_priors(site: Site, blocks: tuple[Block, ...], step: Array) -> Site:
+    """Return a site in which parameters are as uncertain as they were wrong.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        Of all fixed parameters, in typical errors.
+    """
+    sigmas = [
+        np.maximum(
+            block.parameter.sigma(site, block.owner),
+            block.sigma * np.linalg.norm(step[block.columns]),
+        )
+        for block in blocks
+    ]
+    return with_sigmas(initial_calibration(site, 0.0), blocks, sigmas)
+
+
+def with_sigmas(calibration: Calibration, blocks: tuple[Block, ...], sigmas: list[Array]) -> Site:
+    """Return the site of a calibration with new sigmas, each the unit of its tangent vector."""
+    site = calibration.site
+    if site.correlation is not None:
+        own = {(block.group, block.owner, block.kind) for block in blocks}
+        others = site.correlation.kept(lambda one: one[:3] not in own)
+        site = replace(site, correlation=others)
+    for block, sigma in zip(blocks, sigmas, strict=True):
+        site = block.parameter.refined(site, calibration, block.owner, sigma)
     return site
 
 

@@ -7,14 +7,21 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.corrected_site import corrected_site
+from magfusion.estimation.integrity.corrected_site import (
+    corrected_site,
+    released_blocks,
+    with_sigmas,
+    with_wide_priors,
+)
 from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.fixed_parameter_test import amounts, error_in_words
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect, suspects
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
+from magfusion.model.parameters import Block, Calibration, initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -47,6 +54,10 @@ class Correction(NamedTuple):
         Whether they estimate values of parameters, and do not choose among usual mistakes.
     rival : Correction, optional
         What is tried instead where the corrected result is contradicted.
+    released : tuple of Block
+        Parameters that the corrected solution estimates.
+    words : str
+        By how much they are wrong, as in the finding.
     """
 
     finding: Finding
@@ -56,6 +67,8 @@ class Correction(NamedTuple):
     clear: bool = False
     is_estimate: bool = False
     rival: "Correction | None" = None
+    released: tuple[Block, ...] = ()
+    words: str = ""
 
 
 class Trial(NamedTuple, Generic[T]):
@@ -105,7 +118,10 @@ def corrections(
         for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
             spread += share * _outer(rival.moved - best.moved)
         new_site = corrected_site(site, best.fault, best.step)
-        by_score = Correction(finding, new_site, best.fault, spread)
+        released = released_blocks(best.fault)
+        new_site = with_wide_priors(new_site, released, best.step)
+        words = error_in_words(site, best) if released else ""
+        by_score = Correction(finding, new_site, best.fault, spread, released=released, words=words)
         result.append(by_score._replace(spread=_with_rival_frame(site, by_score, 0.5)))
     if diagnosis is not None and diagnosis.site is not None:
         by_snapshots = _by_snapshots(site, diagnosis)
@@ -199,6 +215,36 @@ def corrected_finding(
         remedy=changed_keys(declared, correction.site),
         explained=tuple(explained),
     )
+
+
+def as_estimated(
+    correction: Correction,
+    declared: Site,
+    fitted: Calibration,
+    blocks: tuple[Block, ...],
+    cov: Array,
+) -> Correction:
+    """Return a correction with the values that the corrected solution estimates.
+
+    Parameters
+    ----------
+    declared : Site
+        As given by the user: the correction's site has nothing else changed.
+    fitted, blocks, cov
+        Estimated calibration, its blocks, and their covariance.
+    """
+    own = tuple(b for b in blocks if any(b.key == one.key for one in correction.released))
+    if not own:
+        return correction
+    before = after = initial_calibration(declared, 0.0)
+    sigmas, words = [np.sqrt(np.diagonal(cov))[block.columns] for block in own], []
+    for block, sigma in zip(own, sigmas, strict=True):
+        step = block.parameter.difference(before, fitted, block.owner)
+        after = block.parameter.moved(after, block.owner, step)
+        words.append(amounts(declared, block, step, sigma))
+    text = correction.finding.text.replace(correction.words, "; ".join(words))
+    finding = replace(correction.finding, text=text)
+    return correction._replace(finding=finding, site=with_sigmas(after, own, sigmas))
 
 
 def _with_rival_frame(site: Site, correction: Correction, probability: float) -> Array | None:

@@ -171,7 +171,7 @@ def finding_of(
         result = f"it is tilted by {tilt[0]:+.2g} deg about x and {tilt[1]:+.2g} deg about y"
         remedy = "Rotate positions and attitudes of all beacons back: world z is the plumb line"
     else:
-        result = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
+        result = error_in_words(site, cause)
         remedy = "Correct it by this amount, or declare a sigma of this size to estimate it"
     return Finding(
         cause.code,
@@ -199,16 +199,22 @@ def _largest(cause: ReleasedFault) -> list[Block]:
     return [b for b in moving if size[b.name] > 0.1 * size[moving[0].name]][:4]
 
 
-def _amounts(site: Site, score: Score, cause: ReleasedFault, block: Block) -> str:
+def error_in_words(site: Site, cause: ReleasedFault) -> str:
+    """Return by how much the parameters of a cause are wrong."""
+    sigma = np.sqrt(np.diagonal(cause.cov))
+    return "; ".join(
+        amounts(site, b, b.sigma * cause.step[b.columns], b.sigma * sigma[b.columns])
+        for b in _largest(cause)
+    )
+
+
+def amounts(site: Site, block: Block, step: Array, sigma: Array) -> str:
     """Return the changes of a block's numbers in words, the largest first."""
     unit = block.parameter.display_unit
-    scale = prior_sigma(score.fixed)[block.columns] / unit.size
-    step = scale * cause.step[block.columns]
-    sigma = scale * np.sqrt(np.diagonal(cause.cov))[block.columns]
     order = np.argsort(-np.abs(step), kind="stable")[:3]
     return ", ".join(
         f"{block.parameter.called(site, block.owner, i)}"
-        f" {step[i]:+.3g} ± {sigma[i]:.1g} {unit.text}".rstrip()
+        f" {step[i] / unit.size:+.3g} ± {sigma[i] / unit.size:.1g} {unit.text}".rstrip()
         for i in order.tolist()
     )
 

@@ -27,7 +27,7 @@ from magfusion.units import Array
 
 POSE = 6
 CHECKED_POSES = 5  # poses at which the tree is used too
-# Of a variance, a thousandth of a sigma.  Without fields for minutes the tree's own rounding is 2e-4.
+# Of a variance: a thousandth of a sigma.  Minutes without fields round the tree itself to 2e-4.
 AGREED = 2e-3
 
 
