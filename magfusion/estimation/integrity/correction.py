@@ -242,8 +242,10 @@ def as_estimated(
         step = block.parameter.difference(before, fitted, block.owner)
         after = block.parameter.moved(after, block.owner, step)
         words.append(amounts(declared, block, step, sigma))
-    text = correction.finding.text.replace(correction.words, "; ".join(words))
-    finding = replace(correction.finding, text=text)
+    finding = correction.finding
+    if correction.words:
+        text = finding.text.replace(correction.words, "; ".join(words))
+        finding = replace(finding, text=text)
     return correction._replace(finding=finding, site=with_sigmas(after, own, sigmas))
 
 
@@ -315,7 +317,9 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
     if rest is None or rest.chi_square < LITTLE * rest.freedom:
         return None
     new_site = corrected_site(correction.site, rest.fault, rest.step)
-    return correction._replace(site=new_site, fault=rest.fault)
+    released = released_blocks(rest.fault)
+    new_site = with_wide_priors(new_site, released, rest.step)
+    return correction._replace(site=new_site, fault=rest.fault, released=released)
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:
