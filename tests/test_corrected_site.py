@@ -12,6 +12,7 @@ from magfusion.estimation.integrity.suspects import (
     GYRO_G_SENSITIVITY,
     GYRO_SCALE,
     TILT,
+    TYPICAL_TILT,
     held_blocks,
     suspects,
 )
@@ -48,7 +49,7 @@ def test_one_parameter_moves_fields_as_a_step_of_the_calibration_does(kind: str)
 
 def test_a_tilt_turns_places_and_attitudes_together() -> None:
     fault = next(one for one in suspects(SITE, FIXED) if one.code == TILT)
-    tilted = corrected_site(SITE, fault, fault.combine @ [2.0, -1.0])
+    tilted = corrected_site(SITE, fault, fault.combine @ (np.deg2rad([2.0, -1.0]) / TYPICAL_TILT))
     turn = Rotation.from_rotvec(np.deg2rad([2.0, -1.0, 0.0])).as_matrix()
     for before, after in zip(SITE.beacons, tilted.beacons, strict=True):
         np.testing.assert_allclose(after.position_world, turn @ before.position_world, atol=1e-9)

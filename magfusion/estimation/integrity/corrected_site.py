@@ -15,12 +15,13 @@ from magfusion.estimation.integrity.suspects import (
     GYRO_SCALE,
     STRETCH,
     TILT,
+    TYPICAL_TILT,
     Suspect,
 )
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import PHASE, Block, Calibration, Parameter, initial_calibration
 from magfusion.model.site import Beacon, Site
-from magfusion.units import DEGREE, Array
+from magfusion.units import Array
 
 PER_CENT = 0.01
 EYE, NOTHING = np.eye(3), np.zeros((3, 3))
@@ -75,7 +76,7 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
         size = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
         turn = stretch = EYE
         if fault.code == TILT:
-            turn = Rotation.from_rotvec(DEGREE * np.append(size, 0.0)).as_matrix()
+            turn = Rotation.from_rotvec(TYPICAL_TILT * np.append(size, 0.0)).as_matrix()
         else:
             stretch = (1.0 + PER_CENT * float(size[0])) * EYE
         beacons = tuple(

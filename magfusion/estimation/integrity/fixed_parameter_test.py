@@ -22,6 +22,7 @@ from magfusion.estimation.integrity.score import (
 from magfusion.estimation.integrity.suspects import (
     STRETCH,
     TILT,
+    TYPICAL_TILT,
     Suspect,
     suspects,
 )
@@ -166,8 +167,8 @@ def finding_of(
         result = f"all are {factor:.3g} times as large"
         remedy = "Correct them (peak, not rms; their unit), or declare their sigma"
     elif cause.fault.code == TILT:
-        combine = cause.fault.combine
-        tilt = -np.linalg.lstsq(combine, cause.step, rcond=None)[0]  # the step takes it back
+        size = np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0]
+        tilt = -np.rad2deg(TYPICAL_TILT * size)  # the step takes it back
         result = f"it is tilted by {tilt[0]:+.2g} deg about x and {tilt[1]:+.2g} deg about y"
         remedy = "Rotate positions and attitudes of all beacons back: world z is the plumb line"
     else:

@@ -228,6 +228,7 @@ CODE: dict[Parameter, str] = {
 }
 
 TILT, STRETCH = "survey_tilt", "survey_scale"
+TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned by more
 
 
 class Suspect(NamedTuple):
@@ -324,9 +325,9 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
 def survey_tilt(site: Site, surveyed: tuple[Block, ...], size: int) -> Array:
     """Return the effect of tilting the whole survey about world x and y, shape (size, 2).
 
-    A unit is a typical error of an attitude; gravity and the Earth field stay.
+    A unit is a typical tilt; gravity and the Earth field stay.
     """
-    tilt_world, out = DEGREE * np.eye(3)[:, :2], np.zeros((size, 2))
+    tilt_world, out = TYPICAL_TILT * np.eye(3)[:, :2], np.zeros((size, 2))
     beacons = {beacon.name: beacon for beacon in site.beacons}
     for block in surveyed:
         beacon = beacons[block.owner]
