@@ -27,7 +27,7 @@ from magfusion.estimation.integrity.suspects import (
     suspects,
 )
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
-from magfusion.model.parameters import Block, prior_sigma
+from magfusion.model.parameters import Block, Parameter, prior_sigma
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array
@@ -115,28 +115,38 @@ def causes_of(
         ranked = sorted((one for one in released if one is not None), key=lambda one: -one.gain)
         if not ranked or ranked[0].gain < max(LEAST_EVIDENCE, LEAST_SHARE * first):
             return
-        cause = ranked[0]
+        cause = simplest(ranked)
         if not is_cause(cause, total):
             return
         first = max(first, cause.gain)
         total = total + cause.step
         if cause.is_mistake:
-            yield NamedCause(cause, rivals_of(ranked), total)
+            yield NamedCause(cause, rivals_of(cause, ranked), total)
         selected = information @ cause.cov
         gradient = gradient - information @ cause.step
         information = information - selected @ information
 
 
-def rivals_of(ranked: list[ReleasedFault]) -> list[ReleasedFault]:
-    """Return what explains a log as well as the first, other than as a part of it."""
-    best = ranked[0]
-    own = {block.key for block in best.fault.blocks}
+def simplest(ranked: list[ReleasedFault]) -> ReleasedFault:
+    """Return the part of the first cause with the fewest parameters that explains a log as well."""
+    own = _keys(ranked[0])
+    parts = (one for one in ranked if one.gain > ranked[0].gain - MARGIN and _keys(one) <= own)
+    return min(parts, key=lambda one: one.fault.combine.shape[1])
+
+
+def rivals_of(cause: ReleasedFault, ranked: list[ReleasedFault]) -> list[ReleasedFault]:
+    """Return what explains a log as well as a cause, other than as a part of it."""
+    own = _keys(cause)
 
     def is_other(one: ReleasedFault) -> bool:
-        keys = {block.key for block in one.fault.blocks}
-        return one.fault.code != best.fault.code or not (keys <= own or own <= keys)
+        keys = _keys(one)
+        return one.fault.code != cause.fault.code or not (keys <= own or own <= keys)
 
-    return [one for one in ranked[1:] if one.gain > best.gain - MARGIN and is_other(one)]
+    return [one for one in ranked if one.gain > ranked[0].gain - MARGIN and is_other(one)]
+
+
+def _keys(cause: ReleasedFault) -> set[tuple[Parameter, str]]:
+    return {block.key for block in cause.fault.blocks}
 
 
 def _exceeds_residuals(case: Case, score: Score, one: ReleasedFault, before: Array) -> bool:
