@@ -153,22 +153,22 @@ def _surveyed_exactly(site: Site) -> Site:
     return replace(site, beacons=beacons, platform=platform)
 
 
-def _walks(kind: str, place: Path) -> dict[str, Any]:
+def _walks(kind: str, place: Path, *others: str) -> dict[str, Any]:
     """Return the report of a walk of a minute among steel of a kind, mapped.
 
-    ``second`` is another walk there, ``moved`` one without the steel.
+    Others: ``second`` is another walk there, ``moved`` one without the steel.
     """
     site = replace(demo_site(coil_radius=None), model_error=0.005)
     rng = np.random.default_rng(0)
     beacons = np.array([beacon.position_world for beacon in site.beacons])
     steel = draw_steel(kind, rng, DEMO_BOX_WORLD, beacons)
-    for name, rails in (("log", steel), ("second", steel), ("moved", None)):
+    for name in ("log", *others):
         config = SimulationConfig(
             DEMO_BOX_WORLD,
             duration=60.0,
             imu_rate_hz=100.0,
             magnetometer_rate_hz=160.0,
-            ambient=Ambient(rails=rails),
+            ambient=Ambient(rails=None if name == "moved" else steel),
         )
         write_log(simulate_log(_surveyed_exactly(site), config, rng).log, place / name)
         save_site(site, place / name / "site.yaml")
@@ -184,7 +184,7 @@ def _report(place: Path, *command: object) -> dict[str, Any]:
 @pytest.mark.slow
 def test_a_mesh_is_mapped_and_the_sigmas_are_right(tmp_path: Path) -> None:
     """Of the log, and of the next one by `smooth` and by the filter, which take the map."""
-    report = _walks("mesh", tmp_path)
+    report = _walks("mesh", tmp_path, "second", "moved")
     assert report["verdict"] == "trustworthy"
     assert report["steel_map_used"]
     assert report["attitude_rmse_deg"] < 0.06
