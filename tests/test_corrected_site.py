@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.corrected_site import corrected_site, with_intrinsics
+from magfusion.estimation.integrity.correction import Correction, released
 from magfusion.estimation.integrity.suspects import (
     GYRO_ALIGNMENT,
     GYRO_G_SENSITIVITY,
@@ -19,6 +20,7 @@ from magfusion.estimation.integrity.suspects import (
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
 from magfusion.model.site import Location
+from magfusion.model.trust import Finding
 from magfusion.simulation.demo_site import demo_site
 
 SITE = demo_site()
@@ -56,6 +58,30 @@ def test_a_tilt_turns_places_and_attitudes_together() -> None:
         np.testing.assert_allclose(
             after.world_from_beacon, turn @ before.world_from_beacon, atol=1e-9
         )
+
+
+def test_a_released_parameter_is_as_uncertain_as_it_was_wrong() -> None:
+    """Unless the user has its group fixed; a survey's common errors are not released at all."""
+    lever, tilt = (
+        next(one for one in suspects(SITE, FIXED) if one.finding_code == code)
+        for code in ("lever_arm", TILT)
+    )
+    (block,) = lever.blocks
+    step = np.zeros(FIXED[-1].columns.stop)
+    step[block.columns] = [3.0, 0.0, -4.0]  # cm
+    finding = Finding("lever_arm", "")
+    moved = Correction(finding, corrected_site(SITE, lever, step), lever, step=step)
+    known, free = released(moved, ("phase",)), released(moved, None)
+    assert known.site is moved.site
+    assert not known.released
+    assert free.released == (block,)
+    sensor = free.site.platform.magnetometer
+    np.testing.assert_allclose(sensor.sigma.position_body, 0.05, rtol=1e-9)  # m
+    np.testing.assert_array_equal(
+        sensor.position_body, moved.site.platform.magnetometer.position_body
+    )
+    tilted = Correction(finding, corrected_site(SITE, tilt, step), tilt, step=step)
+    assert released(tilted, None) is tilted
 
 
 def test_errors_of_an_imu_add_to_those_that_are_declared() -> None:

@@ -12,6 +12,7 @@ from magfusion.estimation.integrity.correction import (
     as_estimated,
     best_trial,
     corrected_finding,
+    released,
 )
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
@@ -47,7 +48,8 @@ def corrected(
     if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
         return None
 
-    def tried(correction: Correction) -> Trial[Finished] | None:
+    def tried(one: Correction) -> Trial[Finished] | None:
+        correction = released(one, settings.estimate)
         used = log, correction.site, settings
         try:
             result = smooth(*used, report)

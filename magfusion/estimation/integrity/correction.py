@@ -54,10 +54,12 @@ class Correction(NamedTuple):
         Whether they estimate values of parameters, and do not choose among usual mistakes.
     rival : Correction, optional
         What is tried instead where the corrected result is contradicted.
-    released : tuple of Block
-        Parameters that the corrected solution estimates.
+    step : ndarray, shape (h,), optional
+        By which the score moves the fixed parameters, in typical errors.
     words : str
         By how much they are wrong, as in the finding.
+    released : tuple of Block
+        Parameters that the corrected solution estimates.
     """
 
     finding: Finding
@@ -67,8 +69,9 @@ class Correction(NamedTuple):
     clear: bool = False
     is_estimate: bool = False
     rival: "Correction | None" = None
-    released: tuple[Block, ...] = ()
+    step: Array | None = None
     words: str = ""
+    released: tuple[Block, ...] = ()
 
 
 class Trial(NamedTuple, Generic[T]):
@@ -117,11 +120,14 @@ def corrections(
         spread = np.zeros((len(best.moved), 6, 6))
         for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
             spread += share * _outer(rival.moved - best.moved)
-        new_site = corrected_site(site, best.fault, best.step)
-        released = released_blocks(best.fault)
-        new_site = with_wide_priors(new_site, released, best.step)
-        words = error_in_words(site, best) if released else ""
-        by_score = Correction(finding, new_site, best.fault, spread, released=released, words=words)
+        by_score = Correction(
+            finding,
+            corrected_site(site, best.fault, best.step),
+            best.fault,
+            spread,
+            step=best.step,
+            words=error_in_words(site, best),
+        )
         result.append(by_score._replace(spread=_with_rival_frame(site, by_score, 0.5)))
     if diagnosis is not None and diagnosis.site is not None:
         by_snapshots = _by_snapshots(site, diagnosis)
@@ -217,6 +223,17 @@ def corrected_finding(
     )
 
 
+def released(correction: Correction, groups: tuple[str, ...] | None) -> Correction:
+    """Return a correction whose parameters are estimated, where their groups are (None: all)."""
+    if correction.fault is None or correction.step is None:
+        return correction
+    blocks = released_blocks(correction.fault)
+    if not blocks or (groups is not None and any(b.group not in groups for b in blocks)):
+        return correction
+    site = with_wide_priors(correction.site, blocks, correction.step)
+    return correction._replace(site=site, released=blocks)
+
+
 def as_estimated(
     correction: Correction,
     declared: Site,
@@ -229,19 +246,21 @@ def as_estimated(
     Parameters
     ----------
     declared : Site
-        As given by the user: the correction's site has nothing else changed.
+        As given by the user.
     fitted, blocks, cov
         Estimated calibration, its blocks, and their covariance.
     """
     own = tuple(b for b in blocks if any(b.key == one.key for one in correction.released))
     if not own:
         return correction
-    before = after = initial_calibration(declared, 0.0)
+    before, tried = (initial_calibration(site, 0.0) for site in (declared, correction.site))
+    after = tried
     sigmas, words = [np.sqrt(np.diagonal(cov))[block.columns] for block in own], []
     for block, sigma in zip(own, sigmas, strict=True):
-        step = block.parameter.difference(before, fitted, block.owner)
-        after = block.parameter.moved(after, block.owner, step)
-        words.append(amounts(declared, block, step, sigma))
+        parameter, owner = block.parameter, block.owner
+        after = parameter.moved(after, owner, parameter.difference(tried, fitted, owner))
+        change = parameter.difference(before, fitted, owner)
+        words.append(amounts(declared, block, change, sigma))
     finding = correction.finding
     if correction.words:
         text = finding.text.replace(correction.words, "; ".join(words))
@@ -317,9 +336,7 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
     if rest is None or rest.chi_square < LITTLE * rest.freedom:
         return None
     new_site = corrected_site(correction.site, rest.fault, rest.step)
-    released = released_blocks(rest.fault)
-    new_site = with_wide_priors(new_site, released, rest.step)
-    return correction._replace(site=new_site, fault=rest.fault, released=released)
+    return correction._replace(site=new_site, fault=rest.fault, step=rest.step, released=())
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:

@@ -16,7 +16,7 @@ from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP, check_c
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.correction import Correction
+from magfusion.estimation.integrity.correction import Correction, released
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.factor_of_state import state_factor
 from magfusion.estimation.online.estimation_loop import EstimationLoop
@@ -370,6 +370,7 @@ class Navigator:
 
         It returns no state that this one has returned.
         """
+        correction = released(correction, self.settings.estimate)
         result = Navigator(correction.site, self.settings)
         result.declared = self.declared
         result._loop.try_correction(correction, self._loop, self.declared, self._history.span)
