@@ -15,6 +15,10 @@ from magfusion.estimation.initialization.early import (
     open_start,
 )
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
+from magfusion.estimation.integrity.correction import Correction
+from magfusion.estimation.integrity.suspects import held_blocks, suspects
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.model.parameters import initial_calibration
@@ -111,3 +115,16 @@ def test_one_bad_second_is_no_doubt_of_a_run() -> None:
     assert _summary("inertial_residuals", 0.8, 9.0) is Verdict.DOUBTFUL  # not long ago
     assert _summary("inertial_residuals", 2.0, 20.0) is Verdict.DOUBTFUL
     assert _summary("beacon_pose", 0.8, 20.0) is Verdict.DOUBTFUL
+
+
+def test_a_checkpoint_before_a_start_has_the_reason_and_no_corrections() -> None:
+    """Which were tried when they were found."""
+    site, settings = demo_site(), NavigatorSettings()
+    navigator = Navigator(site, settings)
+    finding = Finding("mounting", "It is turned.", Verdict.FAILED)
+    fault = next(suspects(site, held_blocks(site, (), steady=True)))
+    wrong = NoStart("It is turned.", Trust((finding,)), (Correction(finding, site, fault),))
+    loop = navigator._loop
+    assert loop.search.accepted(wrong, loop.arrived) is None
+    again = restored(site, settings, navigator.checkpoint())
+    assert again.why_no_start == replace(wrong, corrections=())

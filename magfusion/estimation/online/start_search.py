@@ -60,7 +60,7 @@ class StartSearch:
             self.needed = later
             return None
         if isinstance(start, NoStart):
-            self.why = start
+            self.why = replace(start, corrections=())  # tried at once; a checkpoint has none
             self.needed *= 2.0 if start.trust.findings else 1.5
             arrived.limit_history(LONGEST * usual)
             return None
