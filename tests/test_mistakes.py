@@ -86,6 +86,17 @@ def test_a_log_without_a_start_is_navigated_to_its_end(mistake: str) -> None:
 
 
 @pytest.mark.slow
+def test_online_the_frame_is_open_until_motion_shows_which_sensor_is_turned() -> None:
+    """The start takes the IMU's; the lever arm then contradicts it, and the rival is tried."""
+    few = Config(("mounting_x180",), ("rough",), ("ekf",), seed=12)
+    row = next(row for row in run(few, {"workers": 1}) if row.mistake != "good")
+    assert row.right
+    assert "magnetometer's axes are turned" in row.text
+    assert row.nees is not None
+    assert 1.0 < row.nees < 12.6  # 95 % of chi square of six
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistake", "log", "code"),
     [

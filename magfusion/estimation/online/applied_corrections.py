@@ -28,18 +28,20 @@ class AppliedCorrections:
         One a mistake, with its remedy.
     content : str, optional
         Of the corrected site's file, as JSON.
+    rival : Correction, optional
+        Of the last one: tried first where the corrected states are contradicted.  A checkpoint has
+        none.
     """
 
     findings: tuple[Finding, ...]
     content: str | None
-    _turn: float
-    _shift: float
+    _spread: dict[str, tuple[float, float]]  # of attitude (rad) and position (m), by code
     _next: float
     _wait: float
 
     def __init__(self) -> None:
-        self.findings, self.content = (), None
-        self._turn, self._shift = 0.0, 0.0
+        self.findings, self.content, self._spread = (), None, {}
+        self.rival: Correction | None = None
         self._next, self._wait = -np.inf, KEPT
 
     def due(self, now: float) -> bool:
@@ -56,23 +58,27 @@ class AppliedCorrections:
         result = AppliedCorrections()
         finding = corrected_finding(correction, declared, reasons)
         for earlier in self.findings:
-            if earlier.code == finding.code:  # the text of a further step has only the remainder
+            is_step = earlier.code == finding.code and correction is not self.rival
+            if is_step:  # whose text has only the remainder
                 finding = replace(finding, text=earlier.text)
-        known = (f for f in self.findings if f.code != finding.code)
-        result.findings = (*known, finding)
+        known = tuple(f for f in self.findings if f.code != finding.code)
+        result.findings, result.rival = (*known, finding), correction.rival
+        result._spread = {f.code: self._spread[f.code] for f in known if f.code in self._spread}
         result.content = json.dumps(site_content(correction.site))
         result._next, result._wait = self._next, self._wait
         return result
 
     def widen(self, spread: Array) -> None:
-        """Take over the covariance of a pose by the uncertainty of a correction, shape (6, 6)."""
+        """Take over the covariance of a pose by the uncertainty of the last one, shape (6, 6)."""
         largest = [np.linalg.eigvalsh(spread[part, part])[-1] for part in (ROTATION, POSITION)]
-        self._turn, self._shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
+        turn, shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
+        self._spread[self.findings[-1].code] = turn, shift
 
     def doubted(self, judgement: Judgement) -> Judgement:
         """Return a judgement with the doubt that the corrections leave."""
         if not self.findings:
             return judgement
-        turn, shift = np.hypot(judgement.turn, self._turn), np.hypot(judgement.shift, self._shift)
+        own = (judgement.turn, judgement.shift)
+        turn, shift = np.linalg.norm([own, *self._spread.values()], axis=0).tolist()
         judgement = judgement.with_findings(*self.findings)
-        return replace(judgement, turn=float(turn), shift=float(shift))
+        return replace(judgement, turn=turn, shift=shift)

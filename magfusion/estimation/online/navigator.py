@@ -363,7 +363,10 @@ class Navigator:
     def take_corrections(self) -> tuple[Correction, ...]:
         """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
         possible, self._loop.possible = self._loop.possible, ()
-        return possible if possible and self._loop.corrections.due(self._history.newest) else ()
+        applied = self._loop.corrections
+        if not possible or not applied.due(self._history.newest):
+            return ()
+        return possible if applied.rival is None else (applied.rival, *possible)
 
     def with_correction(self, correction: Correction) -> "Navigator":
         """Return a navigator of a corrected site that has processed the newest input again.
