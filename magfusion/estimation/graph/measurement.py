@@ -121,14 +121,9 @@ class Measurement(ABC):
 
     Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them.
     Fields that are not compared do not belong to the measurement itself.
-
-    Parameters
-    ----------
-        State index of each row.
-        Which state each row belongs to.
     """
 
-    epoch: IntArray
+    epoch: IntArray  # state index of each row
 
     @abstractmethod
     def linearize(
