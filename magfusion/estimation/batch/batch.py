@@ -266,10 +266,7 @@ def _solved(
 def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smoothed:
     """Return a posterior with other measurements of the same states, started from the solution.
 
-    Raises
-    ------
-    RuntimeError
-        From GTSAM, where these measurements leave the system singular.
+    Raises RuntimeError from GTSAM, where these measurements leave the system singular.
     """
     graph = replace(result.graph, measurements=measurements)
     estimate = optimise(graph, result.estimate)
@@ -301,12 +298,7 @@ def posterior(
 ) -> Smoothed:
     """Return the posterior of a log from its optimised graph.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Phasors measured in the graph.
-    gaps : int
-        Number of intervals with a bridged gap.
+    `samples`: phasors measured in the graph. `gaps`: number of intervals with a bridged gap.
     """
     estimate = result.estimate
     states, response = read_states(estimate.values, log.states.time), None

@@ -34,10 +34,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     """Yield the body-fixed iron that the declared calibration does not account for.
 
-    Parameters
-    ----------
-    means : StillMeans
-        Over spans of `IRON_SPAN`.
+    `means`: over spans of `IRON_SPAN`.
     """
     if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
         return
@@ -80,11 +77,7 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
 def _fitted(turn: Array, before: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return matrix (9, row by row) and offset (3), their covariance, and the explained share.
 
-    Parameters
-    ----------
-    turn : ndarray, shape (n, 3, 3)
-    before, residual : ndarray, shape (n, 3)
-        Fields in units of their size.
+    `turn` (n, 3, 3). `before`, `residual` (n, 3): fields in units of their size.
     """
     rotated = np.einsum("nij,nj->ni", turn, before)
     eye = np.eye(3)

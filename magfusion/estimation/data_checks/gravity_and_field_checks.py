@@ -51,14 +51,9 @@ def gravity_and_field_findings(
 ) -> Iterator[Finding]:
     """Yield inconsistencies of gravity and static field with the accelerometer and the site.
 
-    The gyroscope, which stabilizes the axes, must be correct.
-
-    Parameters
-    ----------
-    poses : Trajectory, optional
-        By the beacons: they decide which of vertical and field is wrong.
-    estimated : Trajectory, optional
-        By an estimator that also used gravity; decides the cause of a reversed vertical.
+    The gyroscope, which stabilizes the axes, must be correct. `poses`: by the beacons: they decide
+    which of vertical and field is wrong. `estimated`: by an estimator that also used gravity;
+    decides the cause of a reversed vertical.
     """
     means = still_means(log, site)
     if len(means) == 0:
@@ -194,12 +189,8 @@ def wrong_dip(
 ) -> Iterator[Finding]:
     """Yield an angle between vertical and field that differs from the declared Earth field's.
 
-    Parameters
-    ----------
-    mounted : bool
-        Whether gyroscope and field agree, so that the mounting is as declared.
-    upright : bool, optional
-        Whether the poses have the accelerometer's vertical pointing up; None where unknown.
+    `mounted`: whether gyroscope and field agree, so that the mounting is as declared. `upright`:
+    whether the poses have the accelerometer's vertical pointing up; None where unknown.
     """
     assert site.earth_field_world is not None
     declared = float(angle_between(np.array([0.0, 0.0, 1.0]), site.earth_field_world))

@@ -38,22 +38,13 @@ ROUND = (1.0, 0.5, 0.1, 0.01)  # Hz; a nominal frequency is a multiple of one of
 
 @dataclass(frozen=True)
 class Tone:
-    """A tone that is probably a beacon's.
+    """A tone that is probably a beacon's."""
 
-    Parameters
-    ----------
-    frequency_hz, sigma_hz : float
-        Measured value and its sigma.
-    amplitude : float
-        (T)
-    roundness : float
-        Median axis ratio of the field's ellipse: 0 for a single coil, 0.5 to 1 for two in
-        quadrature.
-    """
-
+    # frequency_hz, sigma_hz: measured value and its sigma
     frequency_hz: float
     sigma_hz: float
-    amplitude: float
+    amplitude: float  # (T)
+    # median axis ratio of the field's ellipse: 0 for a single coil, 0.5 to 1 for two in quadrature
     roundness: float
 
     @property
@@ -83,10 +74,7 @@ class Transmitted:
 def transmitted(log: Log, site: Site | None) -> Transmitted | None:
     """Return the tones of a waveform; None if it is too short for a spectrum.
 
-    Parameters
-    ----------
-    site : Site, optional
-        Only for the magnetometer's mounting; its beacons are ignored.
+    `site`: only for the magnetometer's mounting; its beacons are ignored.
     """
     result = spectrum(log, site)
     if result is None or log.waveform is None:

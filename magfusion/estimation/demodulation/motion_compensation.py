@@ -33,28 +33,17 @@ MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
 
 @dataclass(frozen=True, eq=False)
 class MotionCompensated:
-    """Phasors at the centres of the windows, without the effect of motion inside the window.
-
-    Parameters
-    ----------
-    by_time_offset : complex ndarray, shape (n, channels, 3)
-        Derivative of the removed effect by the IMU's time offset at fixed states (T/s).
-    steady : SteadyFields
-        The Earth field and the offset.
-    unseen : bool
-        Whether the motion was unknown, and nothing was removed.
-    unexplained_sensor : ndarray, shape (samples, 3), optional
-        Samples minus their prediction (T), where requested with ``wanted``.
-    wanted : Trajectory, optional
-        Motion at other times.
-    """
+    """Phasors at the centres of the windows, without the effect of motion inside the window."""
 
     fields: FieldSamples
+    # (n, channels, 3), derivative of the removed effect by the IMU's time offset at fixed states
+    # (T/s)
     by_time_offset: ComplexArray
-    steady: SteadyFields
-    unseen: bool = False
+    steady: SteadyFields  # the Earth field and the offset
+    unseen: bool = False  # whether the motion was unknown, and nothing was removed
+    # (samples, 3), samples minus their prediction (T), where requested with ``wanted``
     unexplained_sensor: Array | None = None
-    wanted: Trajectory | None = None
+    wanted: Trajectory | None = None  # motion at other times
 
     @staticmethod
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
@@ -65,21 +54,15 @@ class MotionCompensated:
 
 
 class TakenOff(NamedTuple):
-    """Residuals of samples after a prediction.
+    """Residuals of samples after a prediction."""
 
-    Parameters
-    ----------
-    unexplained_sensor, change_sensor : ndarray, shape (samples, 3)
-        Residual (T), and the prediction's derivative by the IMU's time offset (T/s).
-    wanted : Trajectory, optional
-        Motion at the other requested times.
-    """
-
+    # unexplained_sensor, change_sensor: (samples, 3), residual (T), and the prediction's derivative
+    # by the IMU's time offset (T/s)
     unexplained_sensor: Array
     change_sensor: Array
     active_beacons: ActiveBeacons
     earth_world: Array
-    wanted: Trajectory | None
+    wanted: Trajectory | None  # motion at the other requested times
 
 
 class KnownMotion(NamedTuple):
@@ -104,18 +87,9 @@ def taken_off(
 ) -> TakenOff:
     """Return the residuals of samples after a prediction along a motion.
 
-    Parameters
-    ----------
-    path : Trajectory
-        States between which the motion is interpolated by the IMU.
-    time_offset : float
-        Of the IMU (s).
-    window : float
-        Window length (s) that sets which beacons are predicted.
-    wanted : ndarray, shape (m,), optional
-        Other requested times of the motion (s).
-    known : KnownMotion, optional
-        The motion, if known.
+    `path`: states between which the motion is interpolated by the IMU. `time_offset`: of the IMU
+    (s). `window`: window length (s) that sets which beacons are predicted. `wanted` (m,): other
+    requested times of the motion (s). `known`: the motion, if known.
     """
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
@@ -162,19 +136,10 @@ def demodulate_about(
 
     The raw samples of each window are predicted from the state and the IMU's motion inside the
     window; only the difference to the measured samples passes through the lock-in.
-
-    Parameters
-    ----------
-    measured_sensor : ndarray, shape (samples, 3)
-        (T)
-    states : Trajectory
-        At the centres of the windows.
-    path : Trajectory, optional
-        States between which the motion is interpolated, where these are not those of the windows.
-    wanted : ndarray, shape (m,), optional
-        Other times of the motion (s); with them the residuals are returned too.
-    motion : KnownMotion, optional
-        Along the samples, if known.
+    `measured_sensor` (samples, 3) (T). `states`: at the centres of the windows. `path`: states
+    between which the motion is interpolated, where these are not those of the windows.
+    `wanted` (m,): other times of the motion (s); with them the residuals are returned too.
+    `motion`: along the samples, if known.
     """
     # The field of steel varies within a window by some ten-thousandths of that of the beacons.
     calibration = replace(calibration, site=calibration.site.without_steel())
@@ -252,20 +217,11 @@ def demodulate_predicted(
 ) -> MotionCompensated:
     """Demodulate one window about a predicted state.
 
-    Parameters
-    ----------
-    number : int
-        Of the window.
-    waveform, imu : Waveform, ImuSamples
-        Covering the window and, of the IMU, the interval before it.
-    before, predicted : State
-        At the epoch before and at the centre.
-    offset : float
-        IMU time offset with which the states were propagated (s).
-    blind : bool
-        Whether other samples replace inertial ones.
-    is_lost : bool
-        Whether the predicted position is unknown, so that it does not assign phasors to beacons.
+    `number`: of the window. `waveform`, `imu`: covering the window and, of the IMU, the interval
+    before it. `before`, `predicted`: at the epoch before and at the centre. `offset`: IMU time
+    offset with which the states were propagated (s). `blind`: whether other samples replace
+    inertial ones. `is_lost`: whether the predicted position is unknown, so that it does not assign
+    phasors to beacons.
     """
     assert receiver.grid is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)
@@ -306,16 +262,9 @@ def noisier(
 ) -> FieldSamples:
     """Return phasors with the noise by an error of the motion's shape.
 
-    It is common to all channels: assuming them independent must not average it out.
-
-    Parameters
-    ----------
-    blind : bool ndarray, shape (n,)
-        Windows whose motion was estimated without an IMU.
-    states : Trajectory
-        At their centres.
-    window : float
-        Length of the windows (s).
+    It is common to all channels: assuming them independent must not average it out. `blind` (n,):
+    windows whose motion was estimated without an IMU. `states`: at their centres. `window`: length
+    of the windows (s).
     """
     rows = np.flatnonzero(blind)
     pose = states.world_from_body[rows], states.position_world[rows]

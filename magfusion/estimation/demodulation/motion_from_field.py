@@ -88,19 +88,12 @@ class _Motion:
 
 @dataclass(frozen=True, eq=False)
 class FieldMotion:
-    """Motion of the platform from the field.
+    """Motion of the platform from the field."""
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        Equivalent IMU samples, at the times of the magnetometer's samples on the log's clock, with
-        the biases of the initial state.
-    path : Trajectory
-        Poses and velocities at the same times.
-    """
-
+    # equivalent IMU samples, at the times of the magnetometer's samples on the log's clock, with
+    # the biases of the initial state
     imu: ImuSamples
-    path: Trajectory
+    path: Trajectory  # poses and velocities at the same times
 
 
 def motion_from_field(
@@ -108,16 +101,9 @@ def motion_from_field(
 ) -> FieldMotion | None:
     """Return the motion of the platform from magnetometer samples; None where undetermined.
 
-    Parameters
-    ----------
-    state : State
-        At or before the first sample.
-    waveform : Waveform
-        Following samples.
-    imu : ImuSamples, optional
-        Available samples of the same interval, on the log's clock.
-    longest_step : float
-        Between two inertial samples (s); a longer one is a gap.
+    `state`: at or before the first sample. `waveform`: following samples. `imu`: available samples
+    of the same interval, on the log's clock. `longest_step`: between two inertial samples (s); a
+    longer one is a gap.
     """
     time, calibration = waveform.time, state.calibration
     if len(time) < MIN_SAMPLES:

@@ -165,10 +165,7 @@ def whitened_factor(
 ) -> gtsam.NoiseModelFactor:
     """Return a factor of a whitened error, computed by a callback of GTSAM's form.
 
-    Parameters
-    ----------
-    like : gtsam.noiseModel.Base, optional
-        Noise with the robust loss of the factor, if any.
+    `like`: noise with the robust loss of the factor, if any.
     """
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Unit.Create(rows)
     if isinstance(like, gtsam.noiseModel.Robust):
@@ -192,12 +189,7 @@ def linear_factor(parts: Sequence[tuple[int, Array]]) -> gtsam.NoiseModelFactor:
 class EpochRows:
     """Rows of a measurement at one epoch, computed once for the factors of all its groups.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        Of one epoch.
-    at : MotionKeys
-        A variable that is not in the values is zero.
+    `measurement`: of one epoch. `at`: a variable that is not in the values is zero.
     """
 
     def __init__(self, measurement: Measurement, keys: CalibrationKeys, at: MotionKeys) -> None:
@@ -250,10 +242,7 @@ def measurement_factors(
 ) -> Iterator[gtsam.NoiseModelFactor]:
     """Yield a factor of every group of rows of every epoch that carries information.
 
-    Parameters
-    ----------
-    values : gtsam.Values
-        Those variables are keys of a factor whose derivative is not zero here.
+    `values`: those variables are keys of a factor whose derivative is not zero here.
     """
     for i, epoch in enumerate(measurement.epoch.tolist()):
         motion_keys = MotionKeys(X(epoch), V(epoch), B(epoch))
@@ -270,12 +259,7 @@ def group_factor(
 ) -> gtsam.NoiseModelFactor:
     """Return the factor of a group of rows, with the measurement's robust loss.
 
-    Parameters
-    ----------
-    used : list of int
-        Keys of the factor.
-    components : int
-        Rows of the group.
+    `used`: keys of the factor. `components`: rows of the group.
     """
     loss = shared.measurement.loss
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Unit.Create(components)

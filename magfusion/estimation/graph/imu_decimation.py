@@ -63,27 +63,11 @@ def preintegrate_stream(
 ) -> tuple[list[gtsam.PreintegratedCombinedMeasurementsG], BoolArray]:
     """Preintegrate a whole stream between epochs, in segments.
 
-    Parameters
-    ----------
-    time_offset : float
-        Added to its stamps to bring them to the log's clock (s).
-    epochs : ndarray, shape (n,)
-        (s)
-    gravity : float
-        (m/s^2)
-    accel_bias, gyro_bias : ndarray, shape (n, 3)
-        At which to linearise (m/s^2, rad/s).
-    silence : tuple of ndarray, optional
-        Beginnings and ends of gaps that are filled by other samples (s).
-    roughly : bool
-        Whether approximate sigmas suffice, so that intervals of some tens of samples are decimated.
-
-    Returns
-    -------
-    list
-        One for each interval.
-    bool ndarray, shape (n - 1,)
-        Intervals with a gap.
+    `time_offset`: added to its stamps to bring them to the log's clock (s). `epochs` (n,) (s),
+    `gravity` (m/s^2). `accel_bias`, `gyro_bias` (n, 3): at which to linearise (m/s^2, rad/s).
+    `silence`: beginnings and ends of gaps that are filled by other samples (s). `roughly`: whether
+    approximate sigmas suffice, so that intervals of some tens of samples are decimated. Returns one
+    for each interval; (n - 1,): intervals with a gap.
     """
     before = np.searchsorted(imu.time, epochs - time_offset)
     usual = float(np.median(np.diff(imu.time + time_offset)))
@@ -117,22 +101,11 @@ def thinned(
 ) -> Increments:
     """Join the steps of the long intervals.
 
-    Parameters
-    ----------
-    accel_bias, gyro_bias : ndarray, shape (epochs, 3)
-        At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
-        rounding.
-    ways : tuple of int
-        Numbers of steps that may be joined to one, falling.  For each interval the one that leaves
-        the fewest steps, but at least ``min_steps``.
-    min_steps : int
-        Minimum number of joined steps of an interval.
-
-    Returns
-    -------
-    Increments
-        The given ones where no interval is long.  Intervals with a gap, steps that fill no pair,
-        and steps of fast rotation are not joined.
+    `accel_bias`, `gyro_bias` (epochs, 3): at which they will be preintegrated (m/s^2, rad/s): there
+    the result is the same to rounding. `ways`: numbers of steps that may be joined to one, falling.
+    For each interval the one that leaves the fewest steps, but at least ``min_steps``. `min_steps`:
+    minimum number of joined steps of an interval. Returns the given ones where no interval is long.
+    Intervals with a gap, steps that fill no pair, and steps of fast rotation are not joined.
     """
     steps = increments.first[1:] - increments.first[:-1]
     steps[increments.gap_bridged] = 0
@@ -198,17 +171,9 @@ def _one_after_the_other(moved: Array) -> Array:
 def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
     """Return the motion in single steps, and the rotation angle of each (rad).
 
-    Parameters
-    ----------
-    steps, bias
-        As of `_joined`.
-
-    Returns
-    -------
-    moved : ndarray, shape (k, 2, n, 5, 5)
-        Rotation, velocity and position from rest at the beginning of the step, and its length: an
-        element of the Galilean group, of which GTSAM's integration is a product.
-    angle : ndarray, shape (k, 2, n)
+    `steps`, `bias`: as of `_joined`. Returns `moved` (k, 2, n, 5, 5): rotation, velocity and
+    position from rest at the beginning of the step, and its length: an element of the Galilean
+    group, of which GTSAM's integration is a product; `angle` (k, 2, n).
     """
     dt = steps[6]
     rotation, gained = (steps[:6] - bias[:, None, None]).reshape(2, 3, *dt.shape) * dt
@@ -230,21 +195,10 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     """Return two steps with the same integral as many.
 
     Constant over each step, they give the rotations of the halves, and together velocity and
-    position of the whole.
-
-    Parameters
-    ----------
-    steps : ndarray, shape (7, k, 2, n)
-        Rate, specific force and length of the single steps of both halves.
-    bias : ndarray, shape (6, n)
-        Of gyro and accelerometer (rad/s, m/s^2).
-
-    Returns
-    -------
-    both : ndarray, shape (7, 2, n)
-        Rate, specific force and length.
-    gentle : ndarray of bool, shape (n,)
-        Whether the rotation of both halves is small.
+    position of the whole. `steps` (7, k, 2, n): rate, specific force and length of the single steps
+    of both halves. `bias` (6, n): of gyro and accelerometer (rad/s, m/s^2). Returns
+    `both` (7, 2, n): rate, specific force and length; `gentle` (n,): whether the rotation of both
+    halves is small.
     """
     single, angle = _of_steps(steps, bias)
     halves = _one_after_the_other(single)
@@ -277,15 +231,8 @@ def _small_vectors(turn: Array) -> Array:
 def _by_force(rotation: Array) -> Array:
     """Return velocity and position by a constant specific force over a unit of time.
 
-    Parameters
-    ----------
-    rotation : ndarray, shape (3, ...)
-        Rotation vector at a constant rate (rad).
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 6)
-        Integral, and integral of the integral, of the rotation's matrix.
+    `rotation` (3, ...): rotation vector at a constant rate (rad). Returns (..., 3, 6): integral,
+    and integral of the integral, of the rotation's matrix.
     """
     once = skew(np.moveaxis(rotation, 0, -1))
     twice = once @ once

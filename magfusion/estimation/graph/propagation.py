@@ -27,21 +27,12 @@ _AFTER = np.r_[9:15, 15:18, 24:30]
 
 @dataclass(frozen=True, eq=False)
 class Propagated:
-    """Result of a propagation by the inertial stream.
+    """Result of a propagation by the inertial stream."""
 
-    Parameters
-    ----------
-    state : State
-        At the later time, with its propagated covariance.
-    gap_bridged : bool
-        Whether the stream had a gap.
-    transition, noise : ndarray, shape (15 + calibration, 15 + calibration)
-        Of the state's tangent.
-    """
-
-    state: State
+    state: State  # at the later time, with its propagated covariance
     link: Link
-    gap_bridged: bool
+    gap_bridged: bool  # whether the stream had a gap
+    # transition, noise: (15 + calibration, 15 + calibration), of the state's tangent
     transition: Array
     noise: Array
 
@@ -61,26 +52,11 @@ def propagate(
     """Propagate a state to a later time.
 
     Transition and noise are those of the graph's own inertial factor, so that a filter built on
-    this and the graph agree to round-off.
-
-    Parameters
-    ----------
-    imu : ImuSamples
-        Covering the interval; where it does not, its end values are extended.
-    time : float
-        (s)
-    site : Site
-        Its IMU's noise and its gravity.
-    time_offset : float
-        Added to the IMU's stamps (s).
-    process_noise : ProcessNoise, optional
-        Of the calibration.
-    usual : float, optional
-        Sampling interval of the IMU (s), as in `cut_at_epochs`.
-    blocks : tuple of Block
-        Calibration parameters in the state's tangent.
-    blind : bool
-        Whether other samples replace inertial ones: they have the noise of a gap.
+    this and the graph agree to round-off. `imu`: covering the interval; where it does not, its end
+    values are extended. `time` (s). `site`: its IMU's noise and its gravity. `time_offset`: added
+    to the IMU's stamps (s). `process_noise`: of the calibration. `usual`: sampling interval of the
+    IMU (s), as in `cut_at_epochs`. `blocks`: calibration parameters in the state's tangent.
+    `blind`: whether other samples replace inertial ones: they have the noise of a gap.
     """
     epochs = np.array([state.time, time])
     accel, gyro = state.accel_bias_body, state.gyro_bias_body

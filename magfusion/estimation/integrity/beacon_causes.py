@@ -73,10 +73,7 @@ def _contradicts(known: Snapshots, left: Snapshots, name: str) -> bool:
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
     """Yield what iron on the body, or another scale of all fields, would explain.
 
-    Parameters
-    ----------
-    steady : float, optional
-        Usual size of the steady field, relative to the Earth's.
+    `steady`: usual size of the steady field, relative to the Earth's.
     """
     free = [(MATRIX, MATRIX.owner, 0.3)]
     if known.excess < MISFIT and not known.rejects(free, tests=1):

@@ -60,25 +60,13 @@ OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be
 
 
 class Diagnosis(NamedTuple):
-    """The mistake that explains a log.
-
-    Parameters
-    ----------
-    site : Site, optional
-        In which it is undone, where it can be.
-    ratio : float
-        Of chi square before to that after.
-    is_estimate : bool
-        Whether it has estimated values of parameters.
-    rival : Diagnosis, optional
-        As of `Explanation`, with its probability.
-    """
+    """The mistake that explains a log."""
 
     finding: Finding
-    site: Site | None
-    ratio: float
-    is_estimate: bool = False
-    rival: "Diagnosis | None" = None
+    site: Site | None  # in which it is undone, where it can be
+    ratio: float  # of chi square before to that after
+    is_estimate: bool = False  # whether it has estimated values of parameters
+    rival: "Diagnosis | None" = None  # as of `Explanation`, with its probability
     rival_probability: float = 0.5
 
     @property
@@ -92,13 +80,8 @@ def diagnosed(
 ) -> Diagnosis | None:
     """Return the cause of what the witnesses say, where one explains the log.
 
-    Parameters
-    ----------
-    trust : Trust
-        What they say; where it is trustworthy, nothing is tried, and only what is clear outweighs
-        steel.
-    settings : LockinSettings, optional
-        Of the estimator.
+    `trust`: what they say; where it is trustworthy, nothing is tried, and only what is clear
+    outweighs steel. `settings`: of the estimator.
     """
     if trust.verdict is Verdict.TRUSTWORTHY:
         return None
@@ -209,10 +192,7 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
 def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
     """Return findings in which the changes of beacons precede, and explain, all others.
 
-    Parameters
-    ----------
-    changes : mapping of str to Finding
-        By name of a beacon that is excluded since then, which its change explains.
+    `changes`: by name of a beacon that is excluded since then, which its change explains.
     """
     if not changes:
         return trust

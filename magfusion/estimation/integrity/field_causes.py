@@ -48,18 +48,13 @@ LENGTH_FACTORS = {
 
 
 class Way(NamedTuple):
-    """A site in which a mistake is undone.
-
-    Parameters
-    ----------
-    by_size : callable, optional
-        The same for another size (2,) of the mistake, relative to this one.
-    """
+    """A site in which a mistake is undone."""
 
     code: str
     cause: str
     remedy: str
     site: Site
+    # the same for another size (2,) of the mistake, relative to this one
     by_size: "Callable[[Array], Way] | None" = None
 
 
@@ -216,12 +211,8 @@ def _low_passes(site: Site) -> Iterator[Way]:
 def low_pass(site: Site, tones_hz: Array, near_hz: float, size: Array) -> Way:
     """Return a site whose magnetometer has a low-pass of first order, and a delay.
 
-    Parameters
-    ----------
-    near_hz : float
-        Corner frequency (Hz) that the size refers to.
-    size : ndarray, shape (2,)
-        Logarithm of the corner's ratio to that, and the delay in its radians.
+    `near_hz`: corner frequency (Hz) that the size refers to. `size` (2,): logarithm of the corner's
+    ratio to that, and the delay in its radians.
     """
     corner_hz = near_hz * float(np.exp(size[0]))
     share = tones_hz / corner_hz

@@ -74,19 +74,11 @@ def check_fixed_parameters(case: Case) -> TestResult:
 
 
 class NamedCause(NamedTuple):
-    """A fixed parameter that a log contradicts.
-
-    Parameters
-    ----------
-    rivals : list of ReleasedFault
-        What explains the log as well.
-    total : ndarray, shape (h,)
-        Its step with those of the causes before it.
-    """
+    """A fixed parameter that a log contradicts."""
 
     cause: ReleasedFault
-    rivals: list[ReleasedFault]
-    total: Array
+    rivals: list[ReleasedFault]  # what explains the log as well
+    total: Array  # (h,), its step with those of the causes before it
 
 
 def causes_of(
@@ -97,12 +89,8 @@ def causes_of(
 ) -> Iterator[NamedCause]:
     """Yield the causes, that with most evidence first; the next is of what remains after its step.
 
-    Parameters
-    ----------
-    candidates : callable
-        Candidate faults by information and gradient.
-    is_cause : callable
-        Whether a fault is a cause after a total step.
+    `candidates`: candidate faults by information and gradient. `is_cause`: whether a fault is a
+    cause after a total step.
     """
     information, gradient = score.with_declared(tolerance=False)
     total, first = np.zeros(len(gradient)), 0.0

@@ -38,12 +38,8 @@ def agreed(
 ) -> Agreed:
     """Return a solution without magnetometers that contradict the others.
 
-    Parameters
-    ----------
-    solve : callable
-        Returns the solution of a log and its site.
-    plain : callable
-        The same with noise and model error as declared, so that misfits are comparable.
+    `solve`: returns the solution of a log and its site. `plain`: the same with noise and model
+    error as declared, so that misfits are comparable.
     """
     risk = Risk() if risk is None else risk
     findings: list[Finding] = []

@@ -40,21 +40,11 @@ OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
 class SeparatedSmooth(NamedTuple):
-    """A smoothed trajectory after the exclusion of false fields.
+    """A smoothed trajectory after the exclusion of false fields."""
 
-    Parameters
-    ----------
-    result : Smoothed
-        Where an alarm remains, its covariance covers it.
-    states : StateTrust
-        Of each state.
-    trust : Trust
-        Of the whole.
-    """
-
-    result: Smoothed
-    states: StateTrust
-    trust: Trust
+    result: Smoothed  # where an alarm remains, its covariance covers it
+    states: StateTrust  # of each state
+    trust: Trust  # of the whole
 
 
 def separated_smooth(
@@ -98,12 +88,7 @@ def _without_false(
 ) -> tuple[Smoothed, Separation, BoolArray]:
     """Exclude stretches of beacons, one after the other, while that reduces the separation.
 
-    Returns
-    -------
-    result, separated : Smoothed, Separation
-        Without them.
-    out : bool ndarray, shape (n, beacons)
-        The excluded fields.
+    Returns `result`, `separated`: without them; `out` (n, beacons): the excluded fields.
     """
     out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
     for _ in range(ROUNDS):
@@ -127,10 +112,7 @@ def _without_false(
 def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:
     """Return the judgement of each state, after all tests.
 
-    Parameters
-    ----------
-    result : Smoothed
-        With the covariance that they allow.
+    `result`: with the covariance that they allow.
     """
     before, after = separated.result.states.pose_cov, result.states.pose_cov
     assert before is not None
@@ -142,10 +124,7 @@ def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) 
 def states_between(states: StateTrust, known: Trajectory, dense: Trajectory) -> StateTrust:
     """Return the judgement at other times: that of the nearest state, as far as it applies.
 
-    Parameters
-    ----------
-    known : Trajectory
-        Of the states.
+    `known`: of the states.
     """
     if known is dense:
         return states

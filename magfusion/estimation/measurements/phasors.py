@@ -39,53 +39,30 @@ MANY_COLUMNS = 64  # of parameters, most of which belong to one beacon
 
 @dataclass(frozen=True, eq=False)
 class FieldPhasors(Measurement):
-    """Phasors of all channels, one group each.
+    """Phasors of all channels, one group each."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : ndarray, shape (n, channels, 6)
-        Real, then imaginary part (T); zero where missing.
-    sqrt_information : ndarray, shape (n, channels, 6, 6)
-        Whitening; zero where missing.
-    rate_body : ndarray, shape (n, 3)
-        Angular rate, for the time offset (rad/s).
-    by_time_offset : ndarray, shape (n, channels, 6)
-        Effect of its change on the lock-in at fixed states (T/s).
-    applied_offset : ndarray, shape (n,)
-        IMU time offset used to cut the inertial data (s).
-    moving : bool ndarray, shape (n,)
-        Where the clocks have an effect: not for a stationary platform, where noise of rate and
-        velocity would be taken for information on them.
-    ahead : ndarray, shape (n, channels), optional
-        Time of the measurement after that of the row (s), as of `FieldSamples`.
-    robust : {None, 'huber', 'cauchy'}
-        Loss of each channel.
-    excess : ndarray, shape (n, channels), optional
-        Ratio of the variance used to that of an independent epoch, as epochs close by share a
-        model error.
-    detected : bool ndarray, shape (n, channels), optional
-        Channels that are predicted; None for all.
-    world_from_body, position_world : ndarray, shape (n, 3, 3) and (n, 3), optional
-        Pose at which the fields are linearised instead of the states': for an iterated update.
-    predicted : Predictions
-        Shared by all measurements that differ in their weights alone.
-    """
-
-    time: Array
-    measured: Array
-    sqrt_information: Array
-    rate_body: Array
+    time: Array  # (n,) (s)
+    measured: Array  # (n, channels, 6), real, then imaginary part (T); zero where missing
+    sqrt_information: Array  # (n, channels, 6, 6), whitening; zero where missing
+    rate_body: Array  # (n, 3), angular rate, for the time offset (rad/s)
+    # (n, channels, 6), effect of its change on the lock-in at fixed states (T/s)
     by_time_offset: Array
-    applied_offset: Array
+    applied_offset: Array  # (n,), IMU time offset used to cut the inertial data (s)
+    # (n,), where the clocks have an effect: not for a stationary platform, where noise of rate and
+    # velocity would be taken for information on them
     moving: BoolArray
+    # (n, channels), time of the measurement after that of the row (s), as of `FieldSamples`
     ahead: Array | None = None
-    robust: str | None = None
+    robust: str | None = None  # loss of each channel: 'huber' or 'cauchy'
+    # (n, channels), ratio of the variance used to that of an independent epoch, as epochs close by
+    # share a model error
     excess: Array | None = None
-    detected: BoolArray | None = None
+    detected: BoolArray | None = None  # (n, channels), channels that are predicted; None for all
+    # world_from_body, position_world: (n, 3, 3) and (n, 3), pose at which the fields are linearised
+    # instead of the states': for an iterated update
     world_from_body: Array | None = None
     position_world: Array | None = None
+    # shared by all measurements that differ in their weights alone
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
 
     @property
@@ -334,26 +311,14 @@ def field_phasors(
 ) -> FieldPhasors:
     """Return phasors as a measurement, weighted at approximate poses.
 
-    Parameters
-    ----------
-    epoch : int ndarray, shape (n,)
-        Indices of their states.
-    poses : Trajectory
-        At the same epochs.
-    rate_body : ndarray, shape (n, 3)
-        Angular rate without its bias (rad/s).
-    applied_offset : ndarray, shape (n,)
-        IMU time offset used to cut the inertial data (s).
-    repeats : float
-        Number of epochs that contain each sample of overlapping windows, to count it once.
-    by_time_offset : complex ndarray, shape (n, channels, 3), optional
-        As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
-    shared_by : ndarray, shape (n,), or float
-        Number of epochs with the same model error; at least the number of windows of a sample.
-    standing : bool ndarray, shape (n,), optional
-        Where the platform is known to be stationary.
-    others : bool
-        As of `magfusion.model.noise.measurement_cov`.
+    `epoch` (n,): indices of their states. `poses`: at the same epochs. `rate_body` (n, 3): angular
+    rate without its bias (rad/s). `applied_offset` (n,): IMU time offset used to cut the inertial
+    data (s). `repeats`: number of epochs that contain each sample of overlapping windows, to count
+    it once. `by_time_offset` (n, channels, 3): as of
+    `magfusion.estimation.demodulation.motion_compensation.WaveFields`. `shared_by` (n,), or float:
+    number of epochs with the same model error; at least the number of windows of a sample.
+    `standing` (n,): where the platform is known to be stationary. `others`: as of
+    `magfusion.model.noise.measurement_cov`.
     """
     place = sensor_positions(site, poses)
     together = np.maximum(shared_by, repeats)

@@ -14,22 +14,12 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class PoseFix(Measurement):
-    """A pose from another estimator, one group of six.
+    """A pose from another estimator, one group of six."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    sqrt_information : ndarray, shape (n, 6, 6)
-        Whitening: rotation, then position, body axes.
-    robust : {None, 'huber', 'cauchy'}
-    """
-
-    world_from_body: Array
-    position_world: Array
-    sqrt_information: Array
-    robust: str | None = None
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    sqrt_information: Array  # (n, 6, 6), whitening: rotation, then position, body axes
+    robust: str | None = None  # 'huber' or 'cauchy'
 
     @property
     def loss(self) -> Loss | None:

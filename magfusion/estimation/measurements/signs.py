@@ -26,10 +26,7 @@ OPEN_SIGN = "amplitude near zero, whose sign is open"
 def along_axis(fields: FieldSamples, site: Site) -> FieldSamples:
     """Return amplitudes along the one axis of a site's receiver; phasors unchanged.
 
-    Raises
-    ------
-    InputError
-        Where the receiver has more axes.
+    Raises InputError where the receiver has more axes.
     """
     own = site.platform.magnetometer.axes
     if fields.signed or fields.axes == own:
@@ -54,16 +51,9 @@ def with_signs(
 ) -> FieldSamples:
     """Return amplitudes with the phases predicted at poses, without those of open sign.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        With `FieldSamples.signed` False; their phases are ignored.
-    poses : Trajectory
-        At the same epochs; a covariance widens the range near zero.
-    first : bool
-        Whether the poses are a first guess.
-    every : bool
-        Whether those near zero are included, to compare guesses by the same amplitudes.
+    `samples`: with `FieldSamples.signed` False; their phases are ignored. `poses`: at the same
+    epochs; a covariance widens the range near zero. `first`: whether the poses are a first guess.
+    `every`: whether those near zero are included, to compare guesses by the same amplitudes.
     """
     if samples.signed:
         return samples

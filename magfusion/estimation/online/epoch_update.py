@@ -47,16 +47,10 @@ Estimator = SlidingWindow | ErrorStateFilter
 class EpochUpdate:
     """Processes epochs one by one.
 
-    Parameters
-    ----------
-    estimated, blocks : tuple of Block
-        Calibration parameters that are estimated, and all in the states' tangent.
-    earth : bool
-        Whether the static field is a measurement.
-    lost_beyond : float
-        As of `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m).
-    bank : SubsetBank, optional
-        Filters that exclude each beacon; without it there are no protection levels.
+    `estimated`, `blocks`: calibration parameters that are estimated, and all in the states'
+    tangent. `earth`: whether the static field is a measurement. `lost_beyond`: as of
+    `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m). `bank`: filters that
+    exclude each beacon; without it there are no protection levels.
     """
 
     gate: Gate
@@ -113,10 +107,7 @@ class EpochUpdate:
     ) -> Judgement:
         """Process the measurements at a prediction, and judge the state.
 
-        Parameters
-        ----------
-        samples : FieldSamples, optional
-            Of this epoch; None where it may have a window.
+        `samples`: of this epoch; None where it may have a window.
         """
         before, state = estimator.state, predicted.state
         if predicted.gap_bridged:
@@ -270,11 +261,7 @@ class EpochUpdate:
         """Return fields that pass the gate, and the fix where they are linearised, if any.
 
         If they restart the state, or the last epochs are undone, return the judgement instead.
-
-        Parameters
-        ----------
-        is_lost : bool
-            Whether the state was lost before.
+        `is_lost`: whether the state was lost before.
         """
         state = predicted.state
         if is_lost and self._found_again(estimator, measured, predicted):

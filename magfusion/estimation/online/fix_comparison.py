@@ -25,10 +25,7 @@ class FixComparison:
     ) -> tuple[float, float] | None:
         """Return squared distance and offset (m) of a state from a fix, if it is due and usable.
 
-        Parameters
-        ----------
-        requested : bool
-            Whether a fix is due, whenever the last was.
+        `requested`: whether a fix is due, whenever the last was.
         """
         self._since_compared += 1
         due = state.time >= self._compared_at + COMPARED_EVERY

@@ -24,19 +24,11 @@ MEMORY = 0.95  # of the running mean of the distortion, per epoch
 class Gate:
     """Rejects outliers, and detects a wrong state.
 
-    Attributes
-    ----------
-    counts : Counter
-        Outliers by beacon.
-    distortion : dict of str to float
-        By beacon, running mean of the squared innovation in units of its expectation.
-    refused_in_a_row : int
-        Consecutive epochs with most channels rejected, up to now.
-    outvoted_in_a_row : int
-        Consecutive epochs in which no majority of the beacons was accepted.
-    accepted, refused : dict of str to float
-        Of the last epoch, by beacon, the mean squared innovation of the accepted and of the
-        rejected channels, in the same units.
+    `counts`: outliers by beacon. `distortion`: by beacon, running mean of the squared innovation in
+    units of its expectation. `refused_in_a_row`: consecutive epochs with most channels rejected, up
+    to now. `outvoted_in_a_row`: consecutive epochs in which no majority of the beacons was
+    accepted. `accepted`, `refused`: of the last epoch, by beacon, the mean squared innovation of
+    the accepted and of the rejected channels, in the same units.
     """
 
     counts: Counter[str]
@@ -66,10 +58,7 @@ class Gate:
     def begin(self, noise_freedom: Mapping[str, float]) -> None:
         """Set the limits by the degrees of freedom of each beacon's estimated noise.
 
-        Parameters
-        ----------
-        noise_freedom : mapping of str to float
-            By beacon; the noise of one without is known.
+        `noise_freedom`: by beacon; the noise of one without is known.
         """
         freedom = [noise_freedom.get(name, np.inf) for name in self._names]
         limit = [COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, f) for f in freedom]
@@ -91,12 +80,8 @@ class Gate:
     ) -> Phasors:
         """Return the measurements without the channels that a state does not explain.
 
-        Parameters
-        ----------
-        measurements : FieldPhasors or JointPhasors
-            Of one epoch.
-        valid, refused : bool ndarray, shape (channels,)
-            Channels that the epoch contains, and those that are already rejected.
+        `measurements`: of one epoch. `valid`, `refused` (channels,): channels that the epoch
+        contains, and those that are already rejected.
         """
         distance = measurements.alone().distances(state, self.blocks, self._limit)
         beyond: BoolArray = np.asarray(distance > self._limit)

@@ -55,12 +55,8 @@ def judge_biases(site: Site, state: State, elapsed: float) -> Judgement:
 def judge_gravity(site: Site, residual: DecayingSums, memory: float) -> Judgement:
     """Test the residual of the mean specific force: no platform falls for seconds.
 
-    Parameters
-    ----------
-    residual : DecayingSums
-        Mean specific force minus gravity, world axes (m/s^2), weighted by time.
-    memory : float
-        Its time constant (s).
+    `residual`: mean specific force minus gravity, world axes (m/s^2), weighted by time. `memory`:
+    its time constant (s).
     """
     span = residual.weight  # s of data, without the gaps of the IMU
     if span < LEAST_SPAN or not site.platform.inertial:

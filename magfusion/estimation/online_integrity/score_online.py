@@ -54,19 +54,10 @@ MOST_WAITING = 10  # epochs; larger batches would delay an update
 class OnlineScore:
     """Score test of a running estimate's fixed parameters; of many beacons, of detected ones.
 
-    Parameters
-    ----------
-    estimated, considered : tuple of Block
-        Calibration parameters in the state's tangent.
-    steady : bool
-        Whether the static field is measured.
-
-    Attributes
-    ----------
-    correction : Correction, optional
-        Of the cause in the last result, if there is one.
-    named : tuple of str
-        Owners of the parameters in the last result: of the cause, and what explains it as well.
+    `estimated`, `considered`: calibration parameters in the state's tangent. `steady`: whether the
+    static field is measured. `correction`: of the cause in the last result, if there is one.
+    `named`: owners of the parameters in the last result: of the cause, and what explains it as
+    well.
     """
 
     _sums: Sums | None
@@ -172,12 +163,7 @@ class OnlineScore:
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
         """Propagate the response to a prediction.
 
-        Parameters
-        ----------
-        transition : ndarray, shape (n, n)
-            Of the tangent.
-        imu : ImuSamples
-            Of the interval.
+        `transition` (n, n): of the tangent. `imu`: of the interval.
         """
         if self._sums is not None:
             self._waiting.append(Epoch(after, passed(before, after, transition, imu)))

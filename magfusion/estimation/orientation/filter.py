@@ -71,27 +71,16 @@ ARM_LENGTH = 0.5  # m; of a human arm, each component
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """One processed segment, as needed by a smoother.
-
-    Parameters
-    ----------
-    predicted, state : Orientation
-        Before and after the measurements of its end.
-    transition : ndarray, shape (61, 61)
-    attitude : ndarray, shape (n + 1, 3, 3)
-        ``begin_from_then`` at its samples.
-    disturbance : float
-        Usual deviation of the field then (uT).
-    changed : bool
-        Whether the field was inconsistent with the model, and its disturbance was estimated again.
-    """
+    """One processed segment, as needed by a smoother."""
 
     stretch: OrientationStretch
+    # predicted, state: before and after the measurements of its end
     predicted: Orientation
     state: Orientation
-    transition: Array
-    attitude: Array
-    disturbance: float
+    transition: Array  # (61, 61)
+    attitude: Array  # (n + 1, 3, 3), ``begin_from_then`` at its samples
+    disturbance: float  # usual deviation of the field then (uT)
+    # whether the field was inconsistent with the model, and its disturbance was estimated again
     changed: bool
 
 
@@ -107,15 +96,7 @@ class Row:
 class OrientationFilter:
     """Running estimate of orientation.
 
-    Parameters
-    ----------
-    site : Site
-        Its beacons are ignored.
-
-    Raises
-    ------
-    InputError
-        Where it has no Earth field, or no gravity.
+    `site`: its beacons are ignored. Raises InputError where it has no Earth field, or no gravity.
     """
 
     def __init__(self, site: Site) -> None:

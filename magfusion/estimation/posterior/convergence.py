@@ -22,13 +22,7 @@ def last_move(
     """Return the rms pose change of the last pass, in sigmas, including an unfinished step.
 
     The gauge of a survey is as uncertain as the survey: a step along it is small in these units.
-
-    Parameters
-    ----------
-    after : Trajectory
-        With a covariance.
-    unfinished : Graph and GraphEstimate, optional
-        State of an unconverged loop of the last pass.
+    `after`: with a covariance. `unfinished`: state of an unconverged loop of the last pass.
     """
     cov, moves = after.pose_cov, [pose_steps(before, after)]
     assert cov is not None

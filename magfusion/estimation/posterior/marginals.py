@@ -32,23 +32,12 @@ AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
 
 @dataclass(frozen=True, eq=False)
 class _Marginals:
-    """Covariances from the chain.
+    """Covariances from the chain."""
 
-    Parameters
-    ----------
-    pose_cov : ndarray, shape (n, 6, 6)
-        Of the estimated parameters alone.
-    by_considered : ndarray, shape (n, 6, 6)
-        Contribution of considered parameters.
-    calibration_cov : ndarray, shape (dimension, dimension)
-        Of the estimated parameters alone.
-    response : ndarray, shape (dimension, considered)
-    """
-
-    pose_cov: Array
-    by_considered: Array
-    calibration_cov: Array
-    response: Array
+    pose_cov: Array  # (n, 6, 6), of the estimated parameters alone
+    by_considered: Array  # (n, 6, 6), contribution of considered parameters
+    calibration_cov: Array  # (dimension, dimension), of the estimated parameters alone
+    response: Array  # (dimension, considered)
 
     @property
     def whole(self) -> tuple[Array, Array, Array]:
@@ -62,20 +51,11 @@ def marginals(
 ) -> tuple[Array, Array, Array]:
     """Return the posterior covariance of every pose and of the calibration.
 
-    Parameters
-    ----------
-    considered : tuple of Block
-        Uncertain parameters that were not estimated: the effect of their errors on the estimate is
-        added (a consider covariance).
-
-    Returns
-    -------
-    pose_cov : ndarray, shape (n, 6, 6)
-        Calibration marginalised, its gauge included.
-    calibration_cov : ndarray, shape (dimension, dimension)
-    calibration_response : ndarray, shape (dimension, considered)
-        Change of the calibration by one sigma of each considered parameter, included in its
-        covariance.
+    `considered`: uncertain parameters that were not estimated: the effect of their errors on the
+    estimate is added (a consider covariance). Returns `pose_cov` (n, 6, 6): calibration
+    marginalised, its gauge included; `calibration_cov` (dimension, dimension);
+    `calibration_response` (dimension, considered): change of the calibration by one sigma of each
+    considered parameter, included in its covariance.
     """
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)

@@ -42,19 +42,11 @@ MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 
 @dataclass(frozen=True)
 class Tuned:
-    """One standard deviation of the noise, declared and estimated.
+    """One standard deviation of the noise, declared and estimated."""
 
-    Parameters
-    ----------
-    owner : str
-        Beacon, "imu" or "motion_prior".
-    key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise', or of `OF_MOTION`}
-    declared, estimated : float
-        In the unit of the site's file.
-    """
-
-    owner: str
-    key: str
+    owner: str  # beacon, "imu" or "motion_prior"
+    key: str  # noise_factor, model_error, gyro_noise, accel_noise, or of `OF_MOTION`
+    # declared, estimated: in the unit of the site's file
     declared: float
     estimated: float
 
@@ -115,22 +107,11 @@ def tune(
 ) -> tuple[Tuned, ...]:
     """Return the most probable noise for the residuals of a solved graph.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        As measured in the graph.
-    poses : Trajectory
-        At the samples.
-    declared : Site
-        Whose noise is the prior.
-    windows : float
-        Number of windows that contain each sample.
-    shared_by : ndarray, shape (n,)
-        Number of epochs with the same model error.
-    blind : bool ndarray, shape (n,), optional
-        Epochs with other noise: of a motion estimated without an IMU.
-    considered : tuple of Block
-        Parameters that are not estimated: the effect of their errors on residuals is no noise.
+    `samples`: as measured in the graph. `poses`: at the samples. `declared`: whose noise is the
+    prior. `windows`: number of windows that contain each sample. `shared_by` (n,): number of epochs
+    with the same model error. `blind` (n,): epochs with other noise: of a motion estimated without
+    an IMU. `considered`: parameters that are not estimated: the effect of their errors on residuals
+    is no noise.
     """
     draws = int(np.clip(DRAWN_EPOCHS // len(samples), 1, MAX_DRAWS))
     system = ResidualProjection(graph, estimate, samples, poses, windows, considered, draws=draws)
@@ -184,10 +165,7 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
 def _tuned_imu(system: ResidualProjection, now: Site, declared: Site, smooth: float) -> list[Tuned]:
     """Return the densities of gyro and accelerometer.
 
-    Parameters
-    ----------
-    smooth : float
-        Share of the model error's variance that is smooth.
+    `smooth`: share of the model error's variance that is smooth.
     """
     plain = system.inertial()
     result = []

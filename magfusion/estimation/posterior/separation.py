@@ -34,18 +34,10 @@ UNIT = np.eye(3)
 
 
 class Radius(NamedTuple):
-    """Norms of Gaussian vectors of three numbers, bounded from above.
+    """Norms of Gaussian vectors of three numbers, bounded from above."""
 
-    Parameters
-    ----------
-    whole : ndarray, shape (...)
-        Root of the sum of the variances.
-    largest : ndarray, shape (...)
-        Largest standard deviation of any direction.
-    """
-
-    whole: Array
-    largest: Array
+    whole: Array  # (...), root of the sum of the variances
+    largest: Array  # (...), largest standard deviation of any direction
 
     def tail(self, radius: Array) -> Array:
         """Return an upper bound of the probability that a norm exceeds a radius."""
@@ -90,31 +82,17 @@ class Separation:
     """Estimates without each beacon, relative to the one with all.
 
     Rotation, then position, in axes of any kind.
-
-    Parameters
-    ----------
-    step : ndarray, shape (n, beacons, 6)
-        Estimate without a beacon minus the one with all (rad, m).
-    cov : ndarray, shape (n, 6, 6)
-        Of the estimate with all.
-    subset_cov : ndarray, shape (n, beacons, 6, 6)
-        Without a beacon; not valid where the pose is not determined.
-    separation_cov : ndarray, shape (n, beacons, 6, 6)
-        Of the step.
-    determined : bool ndarray, shape (n, beacons)
-        Whether there is an estimate without a beacon.
-    cost : ndarray, shape (n, beacons)
-        Squared residual without a beacon.
-    rows : ndarray, shape (n, beacons)
-        Number of residuals of each beacon; zero where it is missing, and cannot be faulty.
     """
 
-    step: Array
-    cov: Array
+    step: Array  # (n, beacons, 6), estimate without a beacon minus the one with all (rad, m)
+    cov: Array  # (n, 6, 6), of the estimate with all
+    # (n, beacons, 6, 6), without a beacon; not valid where the pose is not determined
     subset_cov: Array
-    separation_cov: Array
-    determined: BoolArray
-    cost: Array
+    separation_cov: Array  # (n, beacons, 6, 6), of the step
+    determined: BoolArray  # (n, beacons), whether there is an estimate without a beacon
+    cost: Array  # (n, beacons), squared residual without a beacon
+    # (n, beacons), number of residuals of each beacon; zero where it is missing, and cannot be
+    # faulty
     rows: Array
 
     def __or__(self, other: "Separation") -> "Separation":
@@ -160,10 +138,8 @@ class Separation:
     def thresholds(self, risk: Risk, slack: float = 0.0) -> Array:
         """Return the largest step without an alarm, shape (n, beacons, 2) (rad, m).
 
-        Parameters
-        ----------
-        slack : float
-            A step below this number of sigmas of the estimate with all is no alarm: it is covered.
+        `slack`: a step below this number of sigmas of the estimate with all is no alarm: it is
+        covered.
         """
         tests = len(PARTS) * self.step.shape[1]
         limit = self.separation_sigma.beyond(risk.false_alarm / tests)
@@ -181,9 +157,7 @@ class Separation:
     def likely(self, prior: Array) -> Array:
         """Return the probability of each beacon, given that one is faulty, shape (n, beacons).
 
-        Parameters
-        ----------
-        prior : ndarray, shape (n, beacons)
+        `prior` (n, beacons).
         """
         # Omitting more rows explains more; each number is worth two (Akaike).
         cost = np.where(self.determined & (prior > 0.0), self.cost + 2.0 * self.rows, np.inf)
@@ -198,17 +172,10 @@ def linear_separation(
 ) -> Separation:
     """Separate the estimates of linear least squares with whitened rows, independently by epoch.
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (n, rows, 6 + nuisances)
-        By the pose, then by the nuisances.  Missing rows are zero.
-    error : ndarray, shape (n, rows)
-        Predicted minus measured.
-    covariance : ndarray, shape (n, rows, rows), optional
-        The rows' true covariance, where their whitening is an approximation.
-    owner : int ndarray, shape (rows,)
-        Beacon of each row; negative for rows of no beacon.
-    beacons : int
+    `jacobian` (n, rows, 6 + nuisances): by the pose, then by the nuisances. Missing rows are zero.
+    `error` (n, rows): predicted minus measured. `covariance` (n, rows, rows): the rows' true
+    covariance, where their whitening is an approximation. `owner` (rows,): beacon of each row;
+    negative for rows of no beacon.
     """
     step, gain, _ = _estimate(jacobian, error)
     known = np.any(jacobian != 0.0, axis=2)
@@ -229,11 +196,7 @@ def linear_separation(
 def spread(gain: Array, covariance: Array | None) -> Array:
     """Return the covariance of a linear estimate, shape (n, k, k).
 
-    Parameters
-    ----------
-    gain : ndarray, shape (n, k, rows)
-    covariance : ndarray, shape (n, rows, rows), optional
-        The identity by default.
+    `gain` (n, k, rows). `covariance` (n, rows, rows): the identity by default.
     """
     propagated = gain if covariance is None else gain @ covariance
     return propagated @ np.swapaxes(gain, -1, -2)

@@ -41,10 +41,7 @@ class _Unknown(NamedTuple):
 class RangingModel:
     """Residuals of windows and their derivatives; one problem per start.
 
-    Parameters
-    ----------
-    about : ndarray, shape (12 + unknowns,), optional
-        State at which errors of depths and of the model are weighted.
+    `about` (12 + unknowns,): state at which errors of depths and of the model are weighted.
     """
 
     def __init__(self, site: Site, windows: RangingWindows, about: Array | None = None) -> None:

@@ -23,17 +23,8 @@ _TINY = 1e-300
 def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     """Return directions and ranges from a beacon consistent with its phasors at any attitude.
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, tones, 3)
-        (T), in any axes.
-
-    Returns
-    -------
-    direction_beacon : ndarray, shape (n, candidates, 3)
-        Unit vectors.
-    distance : ndarray, shape (n, candidates)
-        (m)
+    `phasor` (n, tones, 3) (T), in any axes. Returns `direction_beacon` (n, candidates, 3): unit
+    vectors; `distance` (n, candidates) (m).
     """
     if beacon.conductivity:
         return _directions_in_ground(beacon, phasor)
@@ -112,19 +103,9 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, residual: Arra
 def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, keep: int) -> Array:
     """Return the sensor positions that agree best in attitude-independent quantities.
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, channels, 3)
-        (T), calibrated axes; zero where missing.
-    weight : ndarray, shape (n, channels)
-        Inverse variance of a component (1/T^2); zero where missing.
-    keep : int
-        Candidates returned for each epoch.
-
-    Returns
-    -------
-    ndarray, shape (n, keep, 3)
-        Of the sensor, world (m).
+    `phasor` (n, channels, 3) (T), calibrated axes; zero where missing. `weight` (n, channels):
+    inverse variance of a component (1/T^2); zero where missing. `keep`: candidates returned for
+    each epoch. Returns (n, keep, 3): of the sensor, world (m).
     """
     site = calibration.site
     result, start = [], 0
@@ -196,24 +177,11 @@ def attitudes(
 ) -> tuple[Array, Array]:
     """Solve Wahba's problem at each candidate position.
 
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, c, 3)
-        (m)
-    phasor : complex ndarray, shape (n, channels, 3)
-        (T), calibrated axes.
-    weight : ndarray, shape (n, channels)
-        (1/T^2)
-    free_parameters : bool ndarray, shape (channels,)
-        Channels whose drive phase is unknown.
-    up_sensor, up_weight : ndarray, shape (n, 3) and (n,), optional
-        Direction of the specific force at rest, and its weight (1/rad^2).
-
-    Returns
-    -------
-    world_from_sensor : ndarray, shape (n, c, 3, 3)
-    phase : ndarray, shape (n, c, channels)
-        (rad); zero where it is known.
+    `sensor_world` (n, c, 3) (m). `phasor` (n, channels, 3) (T), calibrated axes.
+    `weight` (n, channels) (1/T^2). `free_parameters` (channels,): channels whose drive phase is
+    unknown. `up_sensor`, `up_weight` (n, 3) and (n,): direction of the specific force at rest, and
+    its weight (1/rad^2). Returns `world_from_sensor` (n, c, 3, 3); `phase` (n, c, channels) (rad);
+    zero where it is known.
     """
     world = _predicted_at(calibration, sensor_world)
     measured, share = phasor[:, None], weight[:, None]

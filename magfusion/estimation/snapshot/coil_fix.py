@@ -43,17 +43,10 @@ ROUGH = 1e-4  # relative decrease of the cost below which a start has converged
 
 
 class Gain(NamedTuple):
-    """Prior of a coil's gain.
-
-    Parameters
-    ----------
-    nominal : float
-    sigma : float
-        Standard deviation of its logarithm; infinite if it is unknown.
-    """
+    """Prior of a coil's gain."""
 
     nominal: float = 1.0
-    sigma: float = np.inf
+    sigma: float = np.inf  # standard deviation of its logarithm; infinite if it is unknown
 
     @staticmethod
     def of(sensor: Magnetometer, *, free_parameters: bool) -> "Gain":
@@ -66,47 +59,24 @@ class Gain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CoilFixes:
-    """Hypotheses of a coil at each epoch, the most probable first.
+    """Hypotheses of a coil at each epoch, the most probable first."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, hypotheses, 3)
-        Of the coil (m).
-    axis_world : ndarray, shape (n, hypotheses, 3)
-        Its axis times its gain; of unknown sign if the amplitudes have none.
-    cov : ndarray, shape (n, hypotheses, 6, 6)
-        Of position and axis.
-    cost : ndarray, shape (n, hypotheses)
-        Minus twice the logarithm of their likelihood, the first of each epoch its chi square;
-        infinite if an epoch has fewer.
-    determined : bool ndarray, shape (n, hypotheses)
-        False where position, direction or gain is open.
-    freedom : ndarray, shape (n,)
-        Degrees of freedom of the chi square.
-    """
-
-    position_world: Array
+    position_world: Array  # (n, hypotheses, 3), of the coil (m)
+    # (n, hypotheses, 3), its axis times its gain; of unknown sign if the amplitudes have none
     axis_world: Array
-    cov: Array
+    cov: Array  # (n, hypotheses, 6, 6), of position and axis
+    # (n, hypotheses), minus twice the logarithm of their likelihood, the first of each epoch its
+    # chi square; infinite if an epoch has fewer
     cost: Array
-    determined: BoolArray
-    freedom: Array
+    determined: BoolArray  # (n, hypotheses), False where position, direction or gain is open
+    freedom: Array  # (n,), degrees of freedom of the chi square
 
 
 def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFixes:
     """Return position and direction of the coil at each epoch.
 
-    Parameters
-    ----------
-    epochs : CoilEpochs
-        At least one.
-    gain : Gain
-        Of the coil.
-
-    Raises
-    ------
-    EstimationError
-        Where the declared region contains no position to test.
+    `epochs`: at least one. `gain`: of the coil. Raises EstimationError where the declared region
+    contains no position to test.
     """
     known = at_point(calibration)
     places = grid_about(known.site)

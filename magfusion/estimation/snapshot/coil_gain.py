@@ -20,17 +20,8 @@ TO_SIGMA = 1.4826  # of the median deviation
 def with_found_gain(fields: FieldSamples, site: Site) -> Site:
     """Return a site whose one axis has the gain estimated from its epochs, with their scatter.
 
-    Its declared value is not used; the smoother estimates it further, from that prior.
-
-    Parameters
-    ----------
-    fields : FieldSamples
-        Channels in the site's order.
-
-    Raises
-    ------
-    EstimationError
-        Where too few epochs determine a gain.
+    Its declared value is not used; the smoother estimates it further, from that prior. `fields`:
+    channels in the site's order. Raises EstimationError where too few epochs determine a gain.
     """
     sensor = site.platform.magnetometer
     epochs = CoilEpochs.of(fields, site)

@@ -28,30 +28,16 @@ _PAIRS = np.triu_indices(3)
 
 @dataclass(frozen=True, eq=False)
 class CoilEpochs:
-    """Measurements of a coil.
+    """Measurements of a coil."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : complex ndarray, shape (n, channels)
-        Phasors, or amplitudes (T); NaN where missing.
-    sigma : ndarray, shape (n, channels)
-        Of the real and of the imaginary part (T).
-    signed : bool
-        Whether the phase determines the sign.
-    parts : ndarray, shape (channels,), optional
-        Real values of each: two if its field rotates and phases are known, else one.
-    swing, shift : ndarray, shape (n, channels), optional
-        Rotation of the coil since the measurement, or its limit (rad), and one sigma of its
-        displacement (m), if channels are measured in turn.
-    """
-
-    time: Array
-    measured: ComplexArray
-    sigma: Array
-    signed: bool
+    time: Array  # (n,) (s)
+    measured: ComplexArray  # (n, channels), phasors, or amplitudes (T); NaN where missing
+    sigma: Array  # (n, channels), of the real and of the imaginary part (T)
+    signed: bool  # whether the phase determines the sign
+    # (channels,), real values of each: two if its field rotates and phases are known, else one
     parts: IntArray | None = None
+    # swing, shift: (n, channels), rotation of the coil since the measurement, or its limit (rad),
+    # and one sigma of its displacement (m), if channels are measured in turn
     swing: Array | None = None
     shift: Array | None = None
 
@@ -140,11 +126,7 @@ def grid_about(site: Site) -> Array:
     """Return positions to evaluate, shape (g, 3) (m): on spheres around the beacons.
 
     Those outside of the region are included, as some converge to the other side and are mirrored.
-
-    Raises
-    ------
-    EstimationError
-        Where none is inside of the region.
+    Raises EstimationError where none is inside of the region.
     """
     middle, extent = middle_of(site.beacons)
     number = np.arange(DIRECTIONS) + 0.5
@@ -163,24 +145,12 @@ def grid_about(site: Site) -> Array:
 
 
 class CoilGrid(NamedTuple):
-    """Positions, and the response of a coil at each to every axis, or pair of axes.
+    """Positions, and the response of a coil at each to every axis, or pair of axes."""
 
-    Parameters
-    ----------
-    places_world : ndarray, shape (g, 3)
-        (m)
-    field : complex ndarray, shape (g, channels, 3)
-        (T), world axes.
-    design : ndarray, shape (g, rows, unknowns)
-        Of the axis, or of its products.
-    scale : ndarray, shape (g, rows)
-        Weights of the rows: relative to the field, equal everywhere.
-    """
-
-    places_world: Array
-    field: ComplexArray
-    design: Array
-    scale: Array
+    places_world: Array  # (g, 3) (m)
+    field: ComplexArray  # (g, channels, 3) (T), world axes
+    design: Array  # (g, rows, unknowns), of the axis, or of its products
+    scale: Array  # (g, rows), weights of the rows: relative to the field, equal everywhere
 
     @staticmethod
     def of(

@@ -24,12 +24,8 @@ def judged_fixes(
 
     The covariance of an epoch with an alternative is that of both poses with their posterior
     probabilities, about the first.  Errors of the survey are common to all epochs, so that all
-    residuals are tested as one: the median's.
-
-    Parameters
-    ----------
-    numbers : ndarray, shape (n,)
-        Number of real values measured at each epoch.
+    residuals are tested as one: the median's. `numbers` (n,): number of real values measured at
+    each epoch.
     """
     rival = _rival(fixes)
     open_pose = ~fixes.determined[:, 0]

@@ -29,12 +29,8 @@ def contradicting_magnetometers(
 ) -> tuple[Finding, ...]:
     """Return findings for magnetometers that contradict each other about the pose.
 
-    Of three or more, one that contradicts all others while these agree is identified.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Channels in the site's order.
+    Of three or more, one that contradicts all others while these agree is identified. `samples`:
+    channels in the site's order.
     """
     sensors = calibration.site.platform.magnetometers
     if len(sensors) == 1:

@@ -16,12 +16,7 @@ MAD = 1.4826  # ratio of standard deviation and median absolute deviation, norma
 def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
     """Yield a finding for estimated gains, and one for each wrong moment.
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With a gain of every beacon.
-    spread : float
-        Standard deviation of a log-gain.
+    `fixes`: with a gain of every beacon. `spread`: standard deviation of a log-gain.
     """
     yield Finding(
         "gain_spread",

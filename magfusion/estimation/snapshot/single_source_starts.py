@@ -33,15 +33,8 @@ def is_single_source(site: Site) -> bool:
 def starts_about_one(problem: FixProblem) -> tuple[FixState, int]:
     """Return the states that explain epochs of two axes, so many rows an epoch.
 
-    Parameters
-    ----------
-    problem : FixProblem
-        Its whitening is zero where a component is missing.
-
-    Raises
-    ------
-    EstimationError
-        Where the receiver has one axis, or the source's coils span no space.
+    `problem`: its whitening is zero where a component is missing. Raises EstimationError where the
+    receiver has one axis, or the source's coils span no space.
     """
     site = problem.calibration.site
     if len(site.platform.magnetometer.axes) == 1:

@@ -32,25 +32,12 @@ def survey_jacobians(
 ) -> tuple[Array, Array]:
     """Return the whitened Jacobians of the estimated and of the survey parameters of a fix.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Its ``phase`` and ``log_gain`` may have one row for each pose.
-    nuisances : tuple of Block
-        Estimated with the pose.
-    time : ndarray, shape (m,)
-    world_from_body : ndarray, shape (m, 3, 3)
-    position_world : ndarray, shape (m, 3)
-    sqrt_information : ndarray, shape (m, channels, 3, 3)
-        Whitening (1/T); zero where a channel is missing.
-
-    Returns
-    -------
-    by_found : ndarray, shape (m, rows, 6 + nuisances)
-        With respect to the pose and the nuisances.
-    by_survey : ndarray, shape (m, rows, parameters)
-        With respect to each column of the survey prior's square root: one sigma of each parameter,
-        if these are independent.
+    `calibration`: its ``phase`` and ``log_gain`` may have one row for each pose. `nuisances`:
+    estimated with the pose. `time` (m,), `world_from_body` (m, 3, 3), `position_world` (m, 3).
+    `sqrt_information` (m, channels, 3, 3): whitening (1/T); zero where a channel is missing.
+    Returns `by_found` (m, rows, 6 + nuisances): with respect to the pose and the nuisances;
+    `by_survey` (m, rows, parameters): with respect to each column of the survey prior's square
+    root: one sigma of each parameter, if these are independent.
     """
     site, result = calibration.site, dimension(nuisances)
     clocks = choose_blocks(site, (CLOCK_OFFSET.group,), parameters=(CLOCK_OFFSET,))
@@ -66,15 +53,8 @@ def survey_jacobians(
 def whitened(sqrt_information: Array, columns: Array) -> Array:
     """Return columns of the phasors' rows in units of their sigma.
 
-    Parameters
-    ----------
-    sqrt_information : ndarray, shape (m, channels, 3, 3)
-    columns : ndarray, shape (m, channels, 6, k)
-        Of real parts, then imaginary parts (T).
-
-    Returns
-    -------
-    ndarray, shape (m, rows, k)
+    `sqrt_information` (m, channels, 3, 3). `columns` (m, channels, 6, k): of real parts, then
+    imaginary parts (T). Returns (m, rows, k).
     """
     m, channels, _, width = columns.shape
     halves = columns.reshape(m, channels, 2, 3, width)
@@ -86,18 +66,9 @@ def honest_covariance(
 ) -> Array:
     """Return the covariance of an estimate whose weights only approximate the survey error.
 
-    Parameters
-    ----------
-    by_found, by_survey : ndarray, shape (m, rows, ...)
-        From `survey_jacobians`.
-    noise : ndarray, shape (m, rows, rows)
-        Covariance of the whitened noise.
-    inverse, information : ndarray, shape (m, found, found)
-        Of the normal matrix, which may include gravity or a prior.
-
-    Returns
-    -------
-    ndarray, shape (m, found, found)
+    `by_found`, `by_survey` (m, rows, ...): from `survey_jacobians`. `noise` (m, rows, rows):
+    covariance of the whitened noise. `inverse`, `information` (m, found, found): of the normal
+    matrix, which may include gravity or a prior. Returns (m, found, found).
     """
     transposed = np.swapaxes(by_found, 1, 2)
     spread = transposed @ noise @ by_found + information - transposed @ by_found

@@ -74,20 +74,12 @@ def minimise(
 ) -> Solution:
     """Minimise the sum of squares of each problem.
 
-    Parameters
-    ----------
-    model : callable
-        Takes the numbers of the requested problems, shape (k,), and their states, shape (k, ...);
-        returns the normal equations there.
-    start : ndarray, shape (problems, ...)
-        Of any type, also objects: only ``model`` and ``move`` use it.
-    move : callable
-        Takes states (k, ...) and steps (k, n) and returns the moved states; addition by default.
-    max_iterations : int
-        Maximum number.
-    relative, absolute : float
-        A step that decreases the cost by less than this share, or by less than this amount, is
-        the last.
+    `model`: takes the numbers of the requested problems, shape (k,), and their states, shape
+    (k, ...); returns the normal equations there. `start` (problems, ...): of any type, also
+    objects: only ``model`` and ``move`` use it. `move`: takes states (k, ...) and steps (k, n) and
+    returns the moved states; addition by default. `max_iterations`: maximum number. `relative`,
+    `absolute`: a step that decreases the cost by less than this share, or by less than this amount,
+    is the last.
     """
     state = start.copy()
     rows = np.arange(len(state))
@@ -161,15 +153,8 @@ def moved_poses(pose: Array, step: Array) -> Array:
 def conditioning(jacobian: Array) -> Array:
     """Return the smallest over the largest singular value of Jacobians with unit columns.
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (..., d, n)
-        Of any units.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        From 0 to 1: below `SINGULAR` the residuals do not determine a direction.
+    `jacobian` (..., d, n): of any units. Returns (...): from 0 to 1: below `SINGULAR` the residuals
+    do not determine a direction.
     """
     if jacobian.shape[-2] < jacobian.shape[-1]:
         return np.zeros(jacobian.shape[:-2])
@@ -181,11 +166,7 @@ def conditioning(jacobian: Array) -> Array:
 def by_differences(residual: Callable[[Array], Array], state: Array) -> tuple[Array, Array]:
     """Return residuals (k, d) and their Jacobian (k, d, n) by central differences.
 
-    Parameters
-    ----------
-    residual : callable
-        Takes states (k, n), of size one, and returns residuals (k, d).
-    state : ndarray, shape (k, n)
+    `residual`: takes states (k, n), of size one, and returns residuals (k, d). `state` (k, n).
     """
     n = state.shape[-1]
     sides = state[:, None] + DIFFERENCE * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
@@ -197,11 +178,8 @@ def by_differences(residual: Callable[[Array], Array], state: Array) -> tuple[Ar
 def open_inverse(information: Array) -> tuple[Array, BoolArray]:
     """Return the inverse of information matrices, and whether they determine the pose.
 
-    Unobservable directions get a large variance, not an infinite one.
-
-    Parameters
-    ----------
-    information : ndarray, shape (..., 6 + nuisances, 6 + nuisances)
+    Unobservable directions get a large variance, not an infinite one. `information` (..., 6 +
+    nuisances, 6 + nuisances).
     """
     value, vector = np.linalg.eigh(information)
     largest = value[..., -1:]

@@ -18,15 +18,8 @@ def optimise_natively(
 ) -> Optimised[gtsam.Values]:
     """Minimise the cost of a nonlinear graph.
 
-    Parameters
-    ----------
-    tolerance : float
-        Relative decrease of the cost that ends the loop of `bordered`.
-
-    Raises
-    ------
-    EstimationError
-        Where the initial cost is not finite, or the graph cannot be solved.
+    `tolerance`: relative decrease of the cost that ends the loop of `bordered`. Raises
+    EstimationError where the initial cost is not finite, or the graph cannot be solved.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(SHARPER * tolerance)

@@ -23,27 +23,14 @@ from magfusion.units import ComplexArray
 
 @dataclass(frozen=True, eq=False)
 class EpochMeasurements:
-    """Measurements of one epoch.
+    """Measurements of one epoch."""
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Without undetected beacons; as predicted where tones are only measured jointly.
-    phasors : FieldPhasors or JointPhasors
-        The phasors as a measurement.
-    earth : EarthField, optional
-        The static field as a measurement, if it is one.
-    steady : SteadyFields, optional
-        The measured static field, where there is a waveform.
-    repeats : float
-        Number of epochs that contain each sample of overlapping windows.
-    """
-
+    # without undetected beacons; as predicted where tones are only measured jointly
     samples: FieldSamples
-    phasors: FieldPhasors | JointPhasors
-    earth: EarthField | None
-    steady: SteadyFields | None
-    repeats: float
+    phasors: FieldPhasors | JointPhasors  # the phasors as a measurement
+    earth: EarthField | None  # the static field as a measurement, if it is one
+    steady: SteadyFields | None  # the measured static field, where there is a waveform
+    repeats: float  # number of epochs that contain each sample of overlapping windows
 
     @property
     def is_sequential(self) -> bool:
@@ -71,18 +58,10 @@ def measurements_of_fields(
 ) -> EpochMeasurements:
     """Return the fields of one epoch as measurements at a prediction.
 
-    Parameters
-    ----------
-    step : float
-        Since fields were last measured (s).
-    repeats : float
-        Number of epochs that contain each sample of overlapping windows.
-    by_time_offset : complex ndarray, optional
-        Derivative of the phasors by the IMU's time offset, as of `field_phasors`.
-    earth : bool
-        Whether a static field is a measurement.
-    standing : bool
-        Whether the platform is known to be stationary.
+    `step`: since fields were last measured (s). `repeats`: number of epochs that contain each
+    sample of overlapping windows. `by_time_offset`: derivative of the phasors by the IMU's time
+    offset, as of `field_phasors`. `earth`: whether a static field is a measurement. `standing`:
+    whether the platform is known to be stationary.
     """
     now, offset = np.zeros(1, dtype=np.int64), np.full(1, imu.offset)
     rate_body = (imu.rate_body(predicted.time) - predicted.gyro_bias_body)[None]

@@ -22,25 +22,11 @@ BEGINNING = 0.5  # s; of samples, to start a receiver that had none at the first
 class SensorStream:
     """One magnetometer's samples on the log's clock, its receiver, and its pending windows.
 
-    Parameters
-    ----------
-    receiver : Receiver
-        Of this magnetometer only, on the log's clock.  It begins with the first state, and never
-        where phasors are given.
-    name : str
-        Of the samples, for error messages.
-
-    Attributes
-    ----------
-    samples : Buffer
-    windows : deque of int
-        Numbers of windows that are admitted and not demodulated yet.
-    now : int, optional
-        Of the window at the state that is to be predicted.
-    late : int
-        Windows that arrived after the others were processed.
-    unseen : int
-        Windows without inertial samples.
+    `receiver`: of this magnetometer only, on the log's clock. It begins with the first state, and
+    never where phasors are given. `name`: of the samples, for error messages. `windows`: numbers of
+    windows that are admitted and not demodulated yet. `now`: of the window at the state that is to
+    be predicted. `late`: windows that arrived after the others were processed. `unseen`: windows
+    without inertial samples.
     """
 
     receiver: Receiver
@@ -100,16 +86,8 @@ class SensorStream:
     ) -> FieldSamples | None:
         """Check the windows that are complete at a time (s); return the phasors of slots.
 
-        Parameters
-        ----------
-        imu : ImuSamples
-            All stored samples.
-        after : float
-            Windows up to this time are too late (s).
-        state : State
-            The newest.
-        offset : float
-            Added to the IMU's stamps (s).
+        `imu`: all stored samples. `after`: windows up to this time are too late (s). `state`: the
+        newest. `offset`: added to the IMU's stamps (s).
         """
         receiver = self.receiver
         if not receiver.complete(until):
@@ -140,10 +118,8 @@ class SensorStream:
     ) -> MotionCompensated:
         """Return the window at a prediction, by the calibration of this magnetometer.
 
-        Parameters
-        ----------
-        before, predicted, imu, offset, blind, is_lost
-            As of `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
+        `before`, `predicted`, `imu`, `offset`, `blind`, `is_lost`: as of
+        `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
         """
         receiver = self.receiver
         assert isinstance(receiver, LockinReceiver)

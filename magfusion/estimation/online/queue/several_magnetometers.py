@@ -38,10 +38,7 @@ SILENCE = 1.0  # s; plus a window: the others do not wait for one that is silent
 class SeveralArrivals(Arrivals):
     """Streams of a platform with several magnetometers.
 
-    Attributes
-    ----------
-    begun_at : float
-        First stamp of any of them (s).
+    `begun_at`: first stamp of any of them (s).
     """
 
     begun_at: float

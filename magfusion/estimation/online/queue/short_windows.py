@@ -23,17 +23,8 @@ from magfusion.units import Array
 class ShortWindows:
     """The admitted short windows, and the noise of earlier ones.
 
-    Parameters
-    ----------
-    receiver : JointReceiver
-        It begins with the first state.
-
-    Attributes
-    ----------
-    numbers : deque of int
-        Of windows that are not used yet.
-    window : int, optional
-        At the state that is to be predicted.
+    `receiver`: it begins with the first state. `numbers`: of windows that are not used yet.
+    `window`: at the state that is to be predicted.
     """
 
     receiver: JointReceiver
@@ -90,16 +81,9 @@ class ShortWindows:
     ) -> EpochMeasurements:
         """Return the measurement of the current window at a prediction.
 
-        Parameters
-        ----------
-        before, predicted : State
-            At the epoch before and at the centre.
-        waveform, imu : Waveform, ImuSamples
-            Covering the window and, of the IMU, the interval before it.
-        offset : float
-            IMU time offset with which the states were propagated (s).
-        rate_body : ndarray, shape (3,)
-            Without the gyro's bias (rad/s).
+        `before`, `predicted`: at the epoch before and at the centre. `waveform`, `imu`: covering
+        the window and, of the IMU, the interval before it. `offset`: IMU time offset with which the
+        states were propagated (s). `rate_body` (3,): without the gyro's bias (rad/s).
         """
         receiver = self.receiver
         assert receiver.grid is not None
