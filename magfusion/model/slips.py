@@ -30,21 +30,11 @@ POOR = 0.1  # part of the amplitudes that the best length leaves unexplained
 
 @dataclass(frozen=True)
 class Slip:
-    """Samples that an even stream lacks.
+    """Samples that an even stream lacks."""
 
-    Parameters
-    ----------
-    place : int
-        Number of the first sample after it, as counted in the stream.
-    missing : int
-        Number of the missing samples.
-    others : tuple of int
-        Numbers that explain the phases nearly as well.
-    """
-
-    place: int
-    missing: int
-    others: tuple[int, ...] = ()
+    place: int  # number of the first sample after it, as counted in the stream
+    missing: int  # number of the missing samples
+    others: tuple[int, ...] = ()  # numbers that explain the phases nearly as well
 
 
 def log_likelihoods(
@@ -56,14 +46,9 @@ def log_likelihoods(
 ) -> Array:
     """Return the log-likelihood of each number of lost samples, from zero to the largest.
 
-    Parameters
-    ----------
-    before, after : tuple of ndarray, complex ndarray, shapes (n,), (n, tones, columns)
-        Number of the sample, and amplitudes that are referred to it by the tones' phases.
-    noise : ndarray, shape (tones,)
-        Standard deviation of each real part of an amplitude.
-    tones_hz : ndarray, shape (tones,)
-    rate_hz : float
+    `before`, `after` (n,), (n, tones, columns): number of the sample, and amplitudes that are
+    referred to it by the tones' phases. `noise` (tones,): standard deviation of each real part of
+    an amplitude. `tones_hz` (tones,).
     """
     lengths = np.arange(round(LONGEST * rate_hz) + 1)
     step = max(round(GRID * rate_hz), 1)
@@ -132,18 +117,9 @@ def locate_slip(
 ) -> tuple[int, float]:
     """Return the first sample after a slip, and the part of amplitudes that is not smooth.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n, columns)
-        Of the recording, among which it is.
-    first : int
-        Number of the first of them.
-    missing : int
-        Number of the missing samples.
-    place : ndarray, shape (m,)
-        Numbers on the true clock of the amplitudes on both sides.
-    amplitude : complex ndarray, shape (m, tones, columns)
-        Referred to the true clock.
+    `samples` (n, columns): of the recording, among which it is. `first`: number of the first of
+    them. `missing`: number of the missing samples. `place` (m,): numbers on the true clock of the
+    amplitudes on both sides. `amplitude` (m, tones, columns): referred to the true clock.
     """
     middle = 0.5 * (place[0] + place[-1])
     unit = 0.5 * (place[-1] - place[0])

@@ -16,10 +16,8 @@ WIRE_MEAN_DISTANCE = float(np.exp(-0.25))  # of points of a disc from each other
 def circle_mutual(first: Array, second: Array, height: Array) -> Array:
     """Return the mutual inductance of coaxial circular filaments (H).
 
-    Parameters
-    ----------
-    first, second, height : ndarray, shape (n,)
-        Radii, and distance of their planes (m).  Filaments must not coincide.
+    `first`, `second`, `height` (n,): radii, and distance of their planes (m). Filaments must not
+    coincide.
     """
     square = 4.0 * first * second / ((first + second) ** 2 + height**2)
     k = np.sqrt(square)
@@ -30,10 +28,8 @@ def circle_mutual(first: Array, second: Array, height: Array) -> Array:
 def square_mutual(first: Array, second: Array, height: Array) -> Array:
     """Return the mutual inductance of coaxial square filaments with parallel sides (H).
 
-    Parameters
-    ----------
-    first, second, height : ndarray, shape (n,)
-        Half of their sides, and distance of their planes (m).  Filaments must not coincide.
+    `first`, `second`, `height` (n,): half of their sides, and distance of their planes (m).
+    Filaments must not coincide.
     """
     longer, shorter = first + second, first - second
     same, opposite = np.hypot(shorter, height), np.hypot(longer, height)
@@ -51,17 +47,9 @@ MUTUAL = {"circle": circle_mutual, "square": square_mutual}
 def coil_inductance(shape: str, sizes: Array, rows: int, pitch: float, wire: float) -> float:
     """Return the inductance of a coil of whole layers (H).
 
-    Parameters
-    ----------
-    shape : {"circle", "square"}
-    sizes : ndarray, shape (layers,)
-        Radius, or half of the side, of each layer's turns (m).
-    rows : int
-        Turns of a layer.
-    pitch : float
-        From turn to turn along the axis (m).
-    wire : float
-        Diameter of the conductor (m).
+    `shape`: "circle" or "square". `sizes` (layers,): radius, or half of the side, of each layer's
+    turns (m). `rows`: turns of a layer. `pitch`: from turn to turn along the axis (m). `wire`:
+    diameter of the conductor (m).
     """
     step = np.arange(float(rows))
     pairs = np.where(step == 0.0, rows, 2.0 * (rows - step))
