@@ -34,24 +34,15 @@ _PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class AntennaObservability:
-    """Observability of the antennas from couplings at some poses.
-
-    Parameters
-    ----------
-    singular : ndarray
-        Relative to the largest, in descending order: parameters are relative to the coils' moments
-        and sensitivities and to the mean distance.
-    null_space : tuple of str
-        One line for each group of undetermined combinations, in words.
-    min_poses : int
-        Number of these poses, in their order, with which the rank is reached.
-    """
+    """Observability of the antennas from couplings at some poses."""
 
     parameters: int
     rank: int
+    # relative to the largest, in descending order: parameters are relative to the coils' moments
+    # and sensitivities and to the mean distance
     singular: Array
-    null_space: tuple[str, ...]
-    min_poses: int
+    null_space: tuple[str, ...]  # one line for each group of undetermined combinations, in words
+    min_poses: int  # number of these poses, in their order, with which the rank is reached
 
 
 def observability(
@@ -64,17 +55,10 @@ def observability(
 ) -> AntennaObservability:
     """Return the observability of the antennas from a survey, without any prior.
 
-    Parameters
-    ----------
-    survey : AntennaSurvey
-        One survey; its couplings are not used.
-    antenna : Antenna
-        Linearisation point.  Symmetric opposites ((p, c, b) to -(p, c, b), (m, s) to -(m, s)) are
-        beyond a linear analysis.
-    attitudes_known, positions_known : bool
-        Whether the survey provides the attitudes and positions of its poses.
-    centred : bool
-        All coils of an antenna are at its origin; the centres are no parameters.
+    `survey`: one survey; its couplings are not used. `antenna`: linearisation point. Symmetric
+    opposites ((p, c, b) to -(p, c, b), (m, s) to -(m, s)) are beyond a linear analysis.
+    `attitudes_known`, `positions_known`: whether the survey provides the attitudes and positions of
+    its poses. `centred`: all coils of an antenna are at its origin; the centres are no parameters.
     """
     free_parameters = ([] if attitudes_known else [0, 1, 2]) + (
         [] if positions_known else [3, 4, 5]

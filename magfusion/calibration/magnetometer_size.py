@@ -41,18 +41,9 @@ MAX_ITERATIONS = 3
 def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     """Calibrate a rotated magnetometer from the magnitude of the field alone.
 
-    Parameters
-    ----------
-    waveform : Waveform
-    site : Site
-        Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
-
-    Raises
-    ------
-    InputError
-        Where it is rotated too little.
-    EstimationError
-        Where the calibration has no solution.
+    `site`: its sigmas of the magnetometer are the prior, its Earth field sets the scale. Raises
+    InputError where it is rotated too little; EstimationError where the calibration has no
+    solution.
     """
     known = site.platform.magnetometer
     readings = distinct_fields(steady_alone(waveform, site), known)
