@@ -43,29 +43,15 @@ TURN_STEP = 0.6  # rad rms between two knots of a turn, at most: more than pi is
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLog:
-    """A log and its true values.
-
-    Parameters
-    ----------
-    log : Log
-        Its truth is stamped on the log's clock at the IMU's rate.
-    true_site : Site
-        True calibration, noise and time offset of the IMU.
-    drives : Drives
-        True phases and drifts.
-    motion : SimulatedMotion
-        Exact truth at any time.
-    ambient : Ambient, optional
-        With the drawn iron.
-    """
+    """A log and its true values."""
 
     __repr__ = short_repr
 
-    log: Log
-    true_site: Site
-    drives: Drives
-    motion: SimulatedMotion
-    ambient: Ambient | None = None
+    log: Log  # its truth is stamped on the log's clock at the IMU's rate
+    true_site: Site  # true calibration, noise and time offset of the IMU
+    drives: Drives  # true phases and drifts
+    motion: SimulatedMotion  # exact truth at any time
+    ambient: Ambient | None = None  # with the drawn iron
 
     @property
     def time_offset(self) -> float:
@@ -239,24 +225,11 @@ def simulate_fields(
 ) -> FieldSamples:
     """Return phasors with white noise directly, without a waveform and its receiver.
 
-    Parameters
-    ----------
-    site : Site
-        The true site.
-    trajectory : Trajectory
-        One epoch each (time and pose).
-    sigma : float
-        Standard deviation of each component's real, and imaginary, part (T).
-    drives : Drives, optional
-        By default as the site declares.
-    window : float
-        Window length of the samples (s); the field is instantaneous.
-    spheres : Spheres, optional
-        Iron in the room.
-    layers : Layers, optional
-        Of the ground, instead of the full space of the site.
-    bending : Bending, optional
-        Of each beacon's field.
+    `site`: the true site. `trajectory`: one epoch each (time and pose). `sigma`: standard deviation
+    of each component's real, and imaginary, part (T). `drives`: by default as the site declares.
+    `window`: window length of the samples (s); the field is instantaneous. `spheres`: iron in the
+    room. `layers`: of the ground, instead of the full space of the site. `bending`: of each
+    beacon's field.
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time

@@ -32,20 +32,11 @@ class Rests:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedMotion:
-    """A motion, at rest before its start and after its end.
+    """A motion, at rest before its start and after its end."""
 
-    Parameters
-    ----------
-    position : BSpline
-        World position (m) over the path parameter.
-    attitude : RotationSpline
-        World from body over the path parameter.
-    rate : BPoly
-        Derivative of the path parameter by time, over time (s); twice continuously differentiable.
-    """
-
-    position: BSpline
-    attitude: RotationSpline
+    position: BSpline  # world position (m) over the path parameter
+    attitude: RotationSpline  # world from body over the path parameter
+    # derivative of the path parameter by time, over time (s); twice continuously differentiable
     rate: BPoly
 
     def _progress(self, time: Array) -> tuple[Array, Array, Array]:
@@ -109,23 +100,11 @@ def random_walk_motion(
 ) -> SimulatedMotion:
     """Return a smooth random walk inside a box, as of a person or a robot that carries the body.
 
-    Parameters
-    ----------
-    duration : float
-        (s)
-    box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of the path's bounds.
-    speed : float
-        Approximate mean speed while moving (m/s); lower where the box is small, to stay smooth.
-    tilt_rms : float
-        Of the angle between the body's z axis and the vertical (rad), approximate.
-    heading_rate_rms : float
-        Approximate (rad/s).
-
-    Raises
-    ------
-    InputError
-        If the box, the duration or the speed is invalid.
+    `duration` (s). `box_world` (2, 3): lower and upper corner (m) of the path's bounds. `speed`:
+    approximate mean speed while moving (m/s); lower where the box is small, to stay smooth.
+    `tilt_rms`: of the angle between the body's z axis and the vertical (rad), approximate.
+    `heading_rate_rms`: approximate (rad/s). Raises InputError if the box, the duration or the speed
+    is invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests())
     tilt = rng.normal(0.0, tilt_rms / np.sqrt(2.0), (len(knots), 3)) * [1.0, 1.0, 0.0]
@@ -147,19 +126,10 @@ def turning_motion(
 ) -> SimulatedMotion:
     """Return a rotation about all axes, as of a body rotated by hand for calibration.
 
-    Parameters
-    ----------
-    rng, duration, box_world, speed, rests
-        As in `random_walk_motion`.
-    rate_rms : float
-        Of the angular rate (rad/s), approximate.
-    interval : float
-        Of the knots of the attitude (s); a turn of more than pi between two is shortened.
-
-    Raises
-    ------
-    InputError
-        If the box, the duration or the speed is invalid.
+    `rng`, `duration`, `box_world`, `speed`, `rests`: as in `random_walk_motion`. `rate_rms`: of the
+    angular rate (rad/s), approximate. `interval`: of the knots of the attitude (s); a turn of more
+    than pi between two is shortened. Raises InputError if the box, the duration or the speed is
+    invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests(), interval)
     attitudes = [Rotation.random(rng=rng)]
@@ -178,15 +148,8 @@ def driving_motion(
 ) -> SimulatedMotion:
     """Return laps of a vehicle along the longer walls of a box: it drives along its x axis, level.
 
-    Parameters
-    ----------
-    rng, duration, box_world, speed, rests
-        As in `random_walk_motion`.
-
-    Raises
-    ------
-    InputError
-        If the box, the duration or the speed is invalid.
+    `rng`, `duration`, `box_world`, `speed`, `rests`: as in `random_walk_motion`. Raises InputError
+    if the box, the duration or the speed is invalid.
     """
     rate, moving, _ = _progress(duration, rests or Rests(pause=0.0, move=duration))
     box = _checked_box(box_world, speed)

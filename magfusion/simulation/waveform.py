@@ -29,30 +29,19 @@ def _vertical() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Mains:
-    """Hum of power lines, uniform over the room.
+    """Hum of power lines, uniform over the room."""
 
-    Parameters
-    ----------
-    amplitude : float
-        Of the fundamental (T).
-    harmonics : tuple of float
-        Amplitude of the second, third, ... harmonic relative to the fundamental.
-    direction_world : ndarray, shape (3,)
-    """
-
-    amplitude: float
+    amplitude: float  # of the fundamental (T)
     frequency_hz: float = 50.0
+    # amplitude of the second, third, ... harmonic relative to the fundamental
     harmonics: tuple[float, ...] = (0.1, 0.3)
-    direction_world: Array = field(default_factory=_vertical)
+    direction_world: Array = field(default_factory=_vertical)  # (3,)
 
 
 def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
     """Return a sampling rate suitable for the fastest tone and the shortest time slot (Hz).
 
-    Parameters
-    ----------
-    burst : float
-        Length of an unclocked slot (s).
+    `burst`: length of an unclocked slot (s).
     """
     least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
     lengths = [
@@ -79,33 +68,14 @@ def simulate_waveform(
 ) -> Waveform:
     """Return the field of all sources at each sample's own pose, as measured.
 
-    Parameters
-    ----------
-    site : Site
-        The true site.  A missing Earth field is zero.
-    rate_hz : float
-        More than 2.5 samples in the fastest cycle.
-    duration : float
-        (s)
-    mains : Mains, optional
-        Its phases are drawn.  Harmonics beyond half the rate alias, as in an instrument that
-        does not filter.
-    quantisation : float, optional
-        Step of the instrument (T).
-    ambient : Ambient, optional
-        Iron, bending, noise and drift of the room.
-    marks : Marks, optional
-        When the coils of unclocked slots are driven.
-    own : Generator, optional
-        Of the instrument's noise; without it all is drawn from one.
-    begin : float
-        First stamp (s): days are simulated a minute at a time.
-
-    Raises
-    ------
-    InputError
-        If the rate is too low for the tones or slots, coils are driven in time slots whose schedule
-        the site does not declare, or the motion leads through iron.
+    `site`: the true site. A missing Earth field is zero. `rate_hz`: more than 2.5 samples in the
+    fastest cycle. `duration` (s). `mains`: its phases are drawn. Harmonics beyond half the rate
+    alias, as in an instrument that does not filter. `quantisation`: step of the instrument (T).
+    `ambient`: iron, bending, noise and drift of the room. `marks`: when the coils of unclocked
+    slots are driven. `own`: of the instrument's noise; without it all is drawn from one. `begin`:
+    first stamp (s): days are simulated a minute at a time. Raises InputError if the rate is too low
+    for the tones or slots, coils are driven in time slots whose schedule the site does not declare,
+    or the motion leads through iron.
     """
     _check_tones(site, rate_hz, marks, drives)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
