@@ -29,7 +29,7 @@ from magfusion.calibration.magnetometer_start import (
     rival_offset,
     starts,
 )
-from magfusion.calibration.sphere_fit import sphere_fits
+from magfusion.calibration.sphere_fit import FIRST_SIGMA, sphere_fits
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
@@ -51,7 +51,6 @@ SHAKEN = 5  # epochs over which disturbed specific force is looked for
 # Of the sigma by which motion disturbs the vertical: a hand tilts in step with its acceleration,
 # so that many shaken epochs are no more informative than a few.
 IN_STEP = 4.0
-FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
 FIELD_SCALES = (0.05, 20.0)  # by which the first guess of an undeclared field's size may be wrong
 LINEARITY = 2e-5  # of the field; a reading is no better than this, however long the window
 MAX_ITERATIONS = 3

@@ -16,7 +16,7 @@ from magfusion.calibration.magnetometer import (
     refined,
 )
 from magfusion.calibration.magnetometer_graph import GraphFit, MagnetometerPrior
-from magfusion.calibration.magnetometer_log import LINEARITY, LogCalibration
+from magfusion.calibration.magnetometer_log import LINEARITY, MAX_ITERATIONS, LogCalibration
 from magfusion.calibration.magnetometer_start import DISTINCT_CHI_SQUARE, UNLIKELY, mirrored
 from magfusion.calibration.sphere_fit import (
     FIRST_SIGMA,
@@ -35,7 +35,6 @@ from magfusion.units import DEGREE, Array
 NARROW = 3.0 * DEGREE  # RMS in the second direction; less is turning about no axis
 HOMOGENEOUS = 1e-3  # of the field; what steel changes it by over the length of an arm
 WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
-MAX_ITERATIONS = 3
 
 
 def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:

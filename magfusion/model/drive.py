@@ -13,7 +13,7 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, ComplexArray
 
-MAX_READINGS = 1000  # readings of each channel that a running estimator keeps
+MAX_READINGS = 1000  # readings of each channel, or part, that a running estimator keeps
 LEAST_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
 LEAST_ON = 0.05  # of the declared current; below, the drive is off and has no phase
 

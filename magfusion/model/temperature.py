@@ -9,10 +9,10 @@ from itertools import repeat
 
 import numpy as np
 
+from magfusion.model.drive import MAX_READINGS
 from magfusion.units import Array
 
 MAGNETOMETER = "magnetometer"  # name of that part; all others are beacons
-MAX_READINGS = 1000  # readings of each part that a running estimator keeps
 
 
 @dataclass(frozen=True)

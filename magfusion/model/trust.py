@@ -14,6 +14,7 @@ from magfusion.model.short_repr import one_line
 from magfusion.units import Array, IntArray
 
 # Meaning of findings by code: the documentation of ``reasons`` in report.json.
+LISTED = 3  # items of a kind in a sentence; more are counted, or left out
 CODES = {
     "accel_scale": "the mean specific force is not gravity's, by a scale or a bias",
     "accel_units": "the specific force is in another unit",

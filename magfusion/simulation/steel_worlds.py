@@ -7,12 +7,11 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.steel_file import SteelEntry
-from magfusion.simulation.disturbance import draw_spheres
+from magfusion.simulation.disturbance import CLEARANCE, draw_spheres
 from magfusion.simulation.pipe import Pipe
 from magfusion.simulation.steel import Ball, Bar, Body, Sheet, SteelStructure
 from magfusion.units import Array
 
-CLEARANCE = 0.5  # m from the body's range to steel
 BEACON_CLEARANCE = 0.4  # m
 BODY_CLEARANCE = 0.1  # m from one piece to the next
 AROUND = 1.0  # m beyond the beacons and the body's range: where steel is placed

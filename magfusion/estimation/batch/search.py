@@ -12,7 +12,6 @@ import numpy as np
 
 from magfusion.estimation.batch.strides import Strides, strides_between
 from magfusion.estimation.batch.tracks import (
-    MOTION,
     TrackPhasors,
     Tracks,
     propagate_tracks,
@@ -20,6 +19,7 @@ from magfusion.estimation.batch.tracks import (
     track_phasors,
     updated,
 )
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.channel_effects import of_all_sensors

@@ -16,6 +16,7 @@ from magfusion.estimation.graph.preintegration import (
     BRIDGE_GYRO_NOISE,
     bias_walks,
 )
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import whitened
 from magfusion.model.channel_effects import of_all_sensors
@@ -26,9 +27,7 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
-ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL, GYRO = slice(9, 12), slice(12, 15)
-MOTION = 15
 ROUNDS = 3  # of linearisation in one update: the first prediction may be wide
 STRONG_CHI_SQUARE = 16.0  # times the expected chi square, above which a channel is downweighted
 

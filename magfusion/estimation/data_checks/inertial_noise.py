@@ -11,7 +11,7 @@ from magfusion.model.site import ImuModel, Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-BLOCK = 128  # samples per noise measurement
+BLOCK = 128  # samples in which noise, or the scatter, is measured
 QUIETEST = 0.1  # share of the blocks that are assumed to be without vibration
 MIN_BLOCKS = 4  # blocks
 MORE = 4.0  # times what is declared; a declared density is a prior with a factor of two

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.inertial_noise import BLOCK
 from magfusion.estimation.data_checks.resolution import (
     is_scheduled,
     reached_in_steps,
@@ -36,7 +37,6 @@ LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
 AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
 EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
-BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
 
 

@@ -14,7 +14,7 @@ from magfusion.model.noise import sensor_positions, whitening
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import LISTED, Finding, Verdict
 from magfusion.receiver.receivers import received, usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
@@ -27,7 +27,6 @@ FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
 NEAR = 10  # epochs beside a silence that it is compared with
 EDGE = 3  # epochs in which the field of a beacon that is switched off falls
 LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
-LISTED = 3
 CERTAIN_DETECTION_RATIO = (
     3.0  # times the weakest detectable field: beyond, one of many beacons must be detected
 )

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from magfusion.estimation.data_checks.inertial_noise import BLOCK
 from magfusion.estimation.data_checks.resolution import step_of_axes
 from magfusion.estimation.data_checks.samples import (
-    BLOCK,
     CERTAIN_SPIKE,
     SPIKE,
     InstrumentStream,

@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import LISTED, Finding, Verdict
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, IntArray
@@ -22,7 +22,6 @@ MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
 MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
 MIN_LOST_SHARE = 1e-3  # that is no error of its rate
-LISTED = 3  # gaps that are listed
 
 
 class Timing(NamedTuple):

@@ -15,10 +15,12 @@ from magfusion.units import Array, BoolArray
 FALSE_ALARMS = 0.005  # of all tests of one result together
 TEST_FAMILIES = 5  # that share it equally; each applies Holm's procedure to its part
 TEST_BUDGET = FALSE_ALARMS / TEST_FAMILIES
-P_CERTAIN = 1e-9  # probability of six sigma, two-sided: evidence that may fail a result
+P_CERTAIN = 1e-9  # probability of `DETECTION_SIGMAS`, two-sided: evidence that may fail a result
+DETECTION_SIGMAS = 6.0
 # Of the prior's variance; below, a direction has no information from the data.
 MIN_INFORMATION_RATIO = 0.02
 TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are acceptable
+MAD_TO_SIGMA = 1.4826  # standard over median absolute deviation, normal distribution
 _UNDERFLOW = -600.0  # log probability below which the exact function underflows
 
 

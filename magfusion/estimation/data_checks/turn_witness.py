@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.turning import (
     CONTRADICTED,
     EXPLAINED,
@@ -27,7 +28,6 @@ LEAST_ANGLE = 6.0 * DEGREE
 # Deviation of the gyroscope's scale from which it is said; iron on the body looks like tenths.
 SCALE = 0.5
 SCALE_EXPLAINED = 0.9  # of the turn by it
-LIMIT = 6.0  # sigma
 
 
 def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
@@ -100,7 +100,8 @@ def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]
     turn, sigma, better = found.mounting()
     angle = float(np.linalg.norm(turn))
     known = float(np.max(site.platform.magnetometer.sigma.rotation_sensor))
-    if better > BETTER and angle > max(LEAST_ANGLE, LIMIT * float(np.hypot(known, sigma))):
+    least = max(LEAST_ANGLE, DETECTION_SIGMAS * float(np.hypot(known, sigma)))
+    if better > BETTER and angle > least:
         yield Finding(
             "mounting",
             f"magnetometer and gyroscope are turned against each other by {angle / DEGREE:.0f} deg"
@@ -138,7 +139,7 @@ def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[
             Verdict.FAILED,
             1e3,
         )
-    elif bias > max(LIMIT * imu.gyro_bias_sigma, 0.5 * said):
+    elif bias > max(DETECTION_SIGMAS * imu.gyro_bias_sigma, 0.5 * said):
         yield Finding(
             "imu_bias",
             f"{words}: a bias of ({', '.join(f'{v:+.3g}' for v in mean)}) rad/s,"

@@ -25,7 +25,7 @@ CONTRADICTED = 0.5  # explained share of db/dt below which the axes are not thos
 EXPLAINED = 0.7  # by the alternative that is reported
 LONGEST_LAG = 3.0  # s
 LAG_STEP = 0.02  # s
-CORRELATED = 2.0  # consecutive rows that share one residual
+CORRELATED = 2.0  # consecutive rows, of filtered rates or of spans, that share one residual
 _EPSILON = np.zeros((3, 3, 3))
 for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0

@@ -14,7 +14,7 @@ from magfusion.model.parameters import Block
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
 
-AT_ONCE = 2e8  # bytes; fixed parameters are processed in groups of this size
+AT_ONCE = 2e8  # bytes; fixed parameters, and variants, are processed in groups of this size
 PER_COLUMN = 400.0  # bytes per parameter and state, in the graph and eliminated
 
 

@@ -13,6 +13,7 @@ from magfusion.estimation.graph.preintegration import (
     across_held,
     preintegrate,
 )
+from magfusion.estimation.graph.state import MOTION
 from magfusion.model.parameters import (
     Block,
     Calibration,
@@ -26,7 +27,7 @@ from magfusion.units import Array
 
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 STEP = 1e-2  # of a parameter's sigma, of the difference quotient
-ROWS = 15  # of an inertial factor
+ROWS = MOTION  # of an inertial factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,7 @@ import numpy as np
 
 from magfusion.model.parameters import Block, Calibration, Parameter
 from magfusion.model.site import Site
-from magfusion.units import Array
-
-HOUR = 3600.0  # s
+from magfusion.units import HOUR, Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.corrected_site import corrected_site
-from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
@@ -23,7 +23,6 @@ T = TypeVar("T")
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
 MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
-CAUSE_FIRST = 1e6  # weight
 CORRECTED = " The result is corrected for it."
 REFINED = " The remedy is refined by the inertial data."
 

@@ -54,9 +54,10 @@ SEEN = OF_SAMPLES | {
     "undeclared_line",
 }
 CLEAR = 30.0  # ratio of chi square
-FIRST = 1e6  # weight: a cause comes before what it causes
-OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
-OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
+CAUSE_FIRST = 1e6  # weight: a cause comes before what it causes
+OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be beside it
+# But what only says where something is wrong may be of what they show.
+OF_CATCH_ALL = CAUSE_FIRST / 4.0
 
 
 class Diagnosis(NamedTuple):
@@ -113,7 +114,7 @@ def diagnosed(
 
 def _diagnosis(one: Explanation, text: str, verdict: Verdict, several: bool) -> Diagnosis:
     """Return an explanation as a finding; what several magnetometers share is not undone."""
-    weight = OF_CATCH_ALL if one.catch_all else FIRST
+    weight = OF_CATCH_ALL if one.catch_all else CAUSE_FIRST
     finding = Finding(one.code, text, verdict, weight)
     ratio = one.before / max(one.after, 1e-9)
     return Diagnosis(finding, None if several else one.site, ratio, one.found > 0)
@@ -174,7 +175,7 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     if first is None:
         return trust
     # What only says where something is wrong explains no more than what follows of it there.
-    every = first.code in NOT_MEASURED or (cause is not None and first.weight >= FIRST)
+    every = first.code in NOT_MEASURED or (cause is not None and first.weight >= CAUSE_FIRST)
 
     # Where hardly anything is left, no parameter has changed during the log.
     seen = SEEN - {"changed"} if cause is not None and cause.is_clear else SEEN
@@ -203,7 +204,7 @@ def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
     }
     kept = [f for f in kept if f.verdict is not Verdict.DOUBTFUL or f.code not in traces]
     explained = tuple(sorted(traces - {"changed"}))
-    first = (replace(f, weight=FIRST, explained=explained) for f in changes.values())
+    first = (replace(f, weight=CAUSE_FIRST, explained=explained) for f in changes.values())
     return replace(trust, findings=(*kept, *first))
 
 

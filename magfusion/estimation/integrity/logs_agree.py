@@ -9,10 +9,8 @@ from magfusion.estimation.batch.joint import LogInformation, Shared, known_by
 from magfusion.estimation.data_checks.statistics import TEST_BUDGET, TOLERATED, holm, sigmas
 from magfusion.estimation.integrity.priors_of_log import distance
 from magfusion.model.parameters import BeaconParameter
-from magfusion.model.trust import Finding
+from magfusion.model.trust import LISTED, Finding
 from magfusion.units import Array
-
-NAMED = 3  # parameters in a sentence
 
 
 class LogAgreement(NamedTuple):
@@ -101,7 +99,7 @@ def deviation(
 
 def _finding(shared: Shared, name: str, others: list[str], one: Deviation) -> Finding:
     blocks = shared.blocks
-    order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:NAMED]
+    order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:LISTED]
     amounts = ", ".join(f"{blocks[k].name} by {one.by_block[k]:.1f} sigma" for k in order)
     square, freedom, _ = one.tests[-1]
     first = blocks[order[0]]

@@ -23,9 +23,8 @@ from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
 GYRO_UNITS = {
     "in degrees per second": DEGREE,
     "in milliradians per second": 1e-3,

@@ -13,12 +13,11 @@ from magfusion.estimation.posterior.block_tridiagonal_system import (
 )
 from magfusion.estimation.posterior.native_rows import Columns, NativeRows
 from magfusion.estimation.posterior.schur_complement import left_over
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, dimension, placed, prior_sigma
 from magfusion.units import Array
-
-POSE = 6
 
 
 class Responses(NamedTuple):

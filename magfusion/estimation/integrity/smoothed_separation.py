@@ -7,20 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.considered import AT_ONCE
 from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.posterior import block_tridiagonal_system as chains
 from magfusion.estimation.posterior.block_tridiagonal_system import (
     EpochRows,
     block_tridiagonal_system,
     column_groups,
 )
-from magfusion.estimation.posterior.convergence import OPEN_ROTATION
 from magfusion.estimation.posterior.information_contributions import Parts, parts_of
-from magfusion.estimation.posterior.separation import OPEN_POSITION, Separation
+from magfusion.estimation.posterior.separation import OPEN_POSITION, OPEN_ROTATION, Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
@@ -186,7 +185,7 @@ def _without_each(
     """
     count, _, size = parts.parts[0].sums.border.shape
     per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
-    group = max(1, int(chains.AT_ONCE / per_variant))
+    group = max(1, int(AT_ONCE / per_variant))
     known = [one.inverse for one in before] if before else _inverses(parts, kept)
     parts.discard_diagonals()
     out = list(before)
@@ -217,7 +216,7 @@ def _without_each(
 def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:
     """Return `inverses` of all variants together, since each is many small matrices."""
     out: list[Array] = []
-    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
+    group = max(1, int(AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
         out += list(inverses(parts.diagonals(some), parts.following[None]))

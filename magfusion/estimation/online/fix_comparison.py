@@ -5,10 +5,10 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.recovery import AgreedFix, agreed_fix, explains
+from magfusion.estimation.snapshot.fix import AS_LIKELY
 from magfusion.model.samples import FieldSamples
 
 COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes without a request
-AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
 
 
 class FixComparison:

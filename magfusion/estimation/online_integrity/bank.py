@@ -29,6 +29,8 @@ from magfusion.estimation.online_integrity.levels import Levels, LevelsQuery
 from magfusion.estimation.posterior.separation import (
     MIN_COUNT,
     OPEN_POSITION,
+    OPEN_ROTATION,
+    SLACK,
     Separation,
     radii,
 )
@@ -39,11 +41,9 @@ from magfusion.model.trust import Finding, Risk, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
 MAX_FILTERS = 6  # filters without beacons; with more beacons some share one
-SLACK = 3.0  # sigma; smaller deviations are covered
 # Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
 NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no source, or to all beacons
-OPEN_ROTATION = 0.3  # rad; beyond, nothing else determines the attitude
 OPEN = np.repeat([OPEN_ROTATION, OPEN_POSITION, OPEN_POSITION], 3)  # of a filter without a sensor
 
 

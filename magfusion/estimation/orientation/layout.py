@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
 
-MICROTESLA = 1e-6  # T
-
 TURN, SPEED = slice(0, 3), slice(3, 6)
 GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
 OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)

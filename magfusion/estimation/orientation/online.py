@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.stamps import GAP
 from magfusion.estimation.graph.state import ACCEL_BIAS as OWN_ACCEL_BIAS
 from magfusion.estimation.graph.state import GYRO_BIAS as OWN_GYRO_BIAS
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
@@ -17,7 +18,6 @@ from magfusion.estimation.orientation.layout import (
 )
 from magfusion.estimation.orientation.remarks import current_findings, doubts, position_open
 from magfusion.estimation.orientation.stretch import (
-    GAP,
     STEP,
     OrientationStretch,
     corrected_rate,

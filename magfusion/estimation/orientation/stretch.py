@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.orientation.layout import MICROTESLA, Orientation
+from magfusion.estimation.data_checks.stamps import GAP
+from magfusion.estimation.orientation.layout import Orientation
 from magfusion.model.field import skew
-from magfusion.units import Array, BoolArray
+from magfusion.units import MICROTESLA, Array, BoolArray
 
 STEP = 0.1  # s; of a segment
-GAP = 0.5  # s; a longer pause of the inertial samples interrupts propagation
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,6 @@ from magfusion.model.parameters import Block, Calibration, difference, dimension
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
-AT_ONCE = 2e8  # bytes; variants are solved in groups of this size
 SIDES = 6e7  # bytes of right sides at once; considered parameters are processed in groups
 
 

@@ -9,23 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.considered import AT_ONCE, responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.posterior.block_tridiagonal_system import (
-    AT_ONCE,
     block_tridiagonal_system,
     column_groups,
 )
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, dimension
 from magfusion.units import Array
 
-POSE = 6
 CHECKED_POSES = 5  # poses at which the tree is used too
 AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
 

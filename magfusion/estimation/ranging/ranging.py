@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging_data import POSE, RangingWindows
+from magfusion.estimation.posterior.separation import POSE
+from magfusion.estimation.ranging.ranging_data import RangingWindows
 from magfusion.estimation.ranging.ranging_model import RangingModel
 from magfusion.estimation.ranging.ranging_starts import starts
 from magfusion.estimation.solve.batched import (

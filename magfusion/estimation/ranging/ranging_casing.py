@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
+from magfusion.estimation.posterior.separation import POSE
+from magfusion.estimation.ranging.ranging_data import FIRST, RangingWindows
 from magfusion.model.field import observe
 from magfusion.model.physics.casing import (
     MAX_LOG_ERROR,

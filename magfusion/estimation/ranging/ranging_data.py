@@ -10,7 +10,6 @@ from magfusion.units import Array
 # Gauss-Legendre points of a window, relative to its middle and length, for the motion within it.
 WITHIN, SHARE = np.sqrt(0.6) * np.array([-0.5, 0.0, 0.5]), np.array([5.0, 8.0, 5.0]) / 18.0
 FIRST = np.array([1.0, 0.0, 0.0])  # axis of the sensor's body, down its hole
-POSE = 6
 SAME_PLACE_M = 1.0  # m; places of the sensor that are closer count as one
 
 

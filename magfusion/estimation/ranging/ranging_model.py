@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.ranging.ranging_casing import CasingModel, CasingResponse, casing_unknowns
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, SHARE, RangingWindows
+from magfusion.estimation.ranging.ranging_data import FIRST, SHARE, RangingWindows
 from magfusion.estimation.ranging.ranging_noise import (
     WindowPrediction,
     real_and_imaginary,

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.ranging.ranging import Ranged
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
+from magfusion.estimation.ranging.ranging_data import FIRST, RangingWindows
 from magfusion.model.field import skew
 from magfusion.units import Array
 

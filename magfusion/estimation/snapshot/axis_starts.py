@@ -25,12 +25,11 @@ from magfusion.estimation.snapshot.coil_starts import (
 from magfusion.estimation.snapshot.problem import FixProblem, FixState
 from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import predict_channels
-from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+from magfusion.units import TINY, Array, BoolArray, ComplexArray, IntArray
 
 KEPT = 24  # positions of the grid that are refined roughly
 SHAPE = 0.2  # error of the axes fitted there, relative to their length
 LEAST_TURN = 1e-6  # weight of the world's axes, to select the smallest of the open rotations
-_TINY = 1e-300
 
 
 def starts_on_grid(problem: FixProblem) -> tuple[FixState, int]:
@@ -167,7 +166,7 @@ class _AxisGrid:
         target = np.where(there, given, 0.0) * scale
         along = (target[:, None] @ basis)[:, 0]
         total = np.sum(target**2, axis=1)
-        return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY))
+        return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, TINY))
 
     def _basis(self, there: BoolArray) -> tuple[Array, Array]:
         """Return the weights of rows at each position, and a basis of all predictions there."""
@@ -209,7 +208,7 @@ class _AxisGrid:
         length = np.linalg.norm(axes, axis=-1, keepdims=True)
         body = self.axes_body[own]
         body = body / np.linalg.norm(body, axis=-1, keepdims=True)
-        along = np.einsum("gki,kj->gij", axes / np.maximum(length, _TINY), body)
+        along = np.einsum("gki,kj->gij", axes / np.maximum(length, TINY), body)
         gravity = self.problem.gravity
         if gravity is not None and np.isfinite(gravity.sigma[row]):
             along[:, 2] += gravity.up_body[row]

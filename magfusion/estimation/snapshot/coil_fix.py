@@ -18,6 +18,7 @@ from magfusion.estimation.snapshot.coil_starts import (
     mirror,
     softened,
 )
+from magfusion.estimation.snapshot.place import SOFT_EDGE
 from magfusion.estimation.solve.batched import (
     Model,
     NormalEquations,
@@ -33,7 +34,6 @@ from magfusion.units import Array, BoolArray, IntArray
 
 DUPLICATE_DISTANCE = 1e-3  # of the distance; hypotheses closer to one another are one
 RIVAL = 25.0  # chi square above the best, from which a hypothesis is dropped
-SOFT_EDGE = 0.02  # of the distance; uncertainty of a declared plane
 LEAST_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
 UNKNOWNS = 6  # of position, direction and gain
 CHUNK = 200  # epochs refined at once

@@ -15,14 +15,13 @@ from magfusion.model.one_axis import axis_of
 from magfusion.model.parameters import Calibration, predict_channels
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Magnetometer, MagnetometerSigma, Site
-from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+from magfusion.units import TINY, Array, BoolArray, ComplexArray, IntArray
 
 DIRECTIONS, RADII = 400, 28  # of the grid around the beacons
 NEAREST, FARTHEST = 0.15, 8.0  # of their extent
 LIKELY, KEPT = 400, 40  # grid positions that are evaluated again, and that are refined
 SOFT, FLOOR = 0.1, 0.01  # error at a grid position: of an amplitude, of the largest
 FLAT = 1e-9  # of the largest singular value; smaller combinations of channels are unobservable
-_TINY = 1e-300
 _PAIRS = np.triu_indices(3)
 
 
@@ -161,7 +160,7 @@ class CoilGrid(NamedTuple):
         at = np.full(len(places_world), time)
         field = predict_channels(calibration, at, attitude, places_world)
         size = np.linalg.norm(field, axis=2)
-        scale = np.where(size > 0.0, 1.0 / np.maximum(size, _TINY), 0.0)
+        scale = np.where(size > 0.0, 1.0 / np.maximum(size, TINY), 0.0)
         if signed:
             parts = np.concatenate([field.real, field.imag], axis=1)
             return CoilGrid(places_world, field, parts, np.concatenate([scale, scale], axis=1))
@@ -189,7 +188,7 @@ class CoilGrid(NamedTuple):
                 target = np.where(pattern, given[row], 0.0) * scale
                 along = (target[:, None] @ residual)[:, 0]
                 total = np.sum(target**2, axis=1)
-                cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY)
+                cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, TINY)
                 best = np.argsort(cost, kind="stable")[:LIKELY]
                 result = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
                 axes = result[..., 0] if epochs.signed else roots(result[..., 0])
@@ -209,7 +208,7 @@ class CoilGrid(NamedTuple):
         seen = np.where(there, seen, 0.0) / sigma
         measured = np.where(there, epochs.measured[row], 0.0) / sigma
         size = np.sum(np.abs(seen) ** 2, axis=1)
-        factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, _TINY)
+        factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, TINY)
         residual = measured - factor[:, None] * seen
         return np.sum(np.abs(residual) ** 2, axis=1), axes * factor[:, None]
 
@@ -229,4 +228,4 @@ def roots(pairs: Array) -> Array:
     matrix[:, _PAIRS[1], _PAIRS[0]] = pairs
     value, vector = np.linalg.eigh(matrix)
     least = 1e-6 * np.max(np.abs(value), axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.maximum(value[:, -1:], least + _TINY)) * vector[:, :, -1])
+    return np.asarray(np.sqrt(np.maximum(value[:, -1:], least + TINY)) * vector[:, :, -1])

@@ -9,6 +9,8 @@ from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
+AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
+
 
 class Gravity(NamedTuple):
     """Direction of the specific force, if the platform is at rest or nearly so."""

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, log_p_chi_square
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.priors import TOLERATED, unexplained
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict, worst
@@ -14,7 +15,6 @@ from magfusion.units import Array, BoolArray, IntArray
 
 RIVAL = 0.05  # posterior probability from which a second pose counts
 FEW = 0.05  # share of epochs that may be open before the whole is in doubt
-UNKNOWNS = 6
 
 
 def judged_fixes(
@@ -66,7 +66,7 @@ def _chi_square(fixes: Fixes, numbers: IntArray) -> tuple[Array, Array]:
     """Return the chi square of each epoch's best pose and its degrees of freedom."""
     result = np.sum(fixes.phase[:, 0] != 0.0, axis=1) + np.sum(fixes.log_gain[:, 0] != 0.0, axis=1)
     known = 2.0 * (fixes.gravity_cost[:, 0] > 0.0)
-    return fixes.cost[:, 0], np.maximum(numbers + known - UNKNOWNS - result, 0.0)
+    return fixes.cost[:, 0], np.maximum(numbers + known - POSE - result, 0.0)
 
 
 def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:

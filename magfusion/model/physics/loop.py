@@ -20,11 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.units import MU0_OVER_4PI, Array
+from magfusion.units import MU0_OVER_4PI, TINY, Array
 
 _MOST_MEANS = 10  # iterations, each of which doubles the digits; needed at the wire
 _WIRE = 1e-6  # of the radius, about; half the wire's thickness, so that the field stays finite
-_TINY = 1e-300
 
 
 class _Loop(NamedTuple):
@@ -69,7 +68,7 @@ def loop_field_and_gradient(
     axis, across = seen.axis, seen.across
     mixed = axis[..., :, None] * across[..., None, :]
     # Where rounding loses the distance from the axis, the numerators vanish with it.
-    outward = (by_axial + 2.0 * seen.radial) / np.maximum(s, _TINY)
+    outward = (by_axial + 2.0 * seen.radial) / np.maximum(s, TINY)
     gradient = (by_axial - seen.radial)[..., None] * axis[..., :, None] * axis[..., None, :]
     gradient += shear[..., None] * (mixed + np.swapaxes(mixed, -1, -2))
     gradient -= outward[..., None] * across[..., :, None] * across[..., None, :]
