@@ -134,10 +134,7 @@ def in_units_of_sensitivity(readings: ProbeReadings, vector: Array) -> ProbeRead
 
 
 def left_out_errors(
-    readings: ProbeReadings,
-    start: Array,
-    sigma: Array,
-    predict: Predict = read_of_term,
+    readings: ProbeReadings, start: Array, sigma: Array, predict: Predict = read_of_term
 ) -> tuple[Array, Array]:
     """Return leave-one-point-out errors relative to the field there, of the start and of fits.
 

@@ -115,10 +115,7 @@ def check_installation(marked: MarkedSnapshots) -> InstallationCheck:
         poses = worst.estimate.turn, worst.estimate.place
     every = named | {name: _check_of(declared, fit) for name, fit in fits.items()}
     return InstallationCheck(
-        tuple(every[beacon.name] for beacon in declared.site.beacons),
-        before,
-        freedom,
-        marked.site,
+        tuple(every[beacon.name] for beacon in declared.site.beacons), before, freedom, marked.site
     )
 
 

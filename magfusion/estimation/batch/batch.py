@@ -32,9 +32,7 @@ from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.posterior.convergence import last_move, refuse_open
 from magfusion.estimation.posterior.marginals import marginals
-from magfusion.estimation.posterior.noise_tuning import (
-    Tuned,
-)
+from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.estimation.snapshot.survey_error import survey_response
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.estimation.solve.memory import give_back_memory

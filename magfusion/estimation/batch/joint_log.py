@@ -89,9 +89,7 @@ def solve_round(
     blocks, states = ready.blocks, ready.states
     every = tuple(retract(declared, blocks, step) for step in kept.steps)
     ready = replace(
-        ready,
-        declared=with_prior(prior, shared, declared),
-        blocks=as_prior(prior, shared, blocks),
+        ready, declared=with_prior(prior, shared, declared), blocks=as_prior(prior, shared, blocks)
     )
     segments = every if len(every) > 1 else ()
     calibration = every[len(every) // 2]

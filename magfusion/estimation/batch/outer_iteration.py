@@ -16,12 +16,7 @@ from magfusion.estimation.graph.gtsam_graph import NativeProblem
 from magfusion.estimation.measurements.zero_velocity import may_stand, slow_enough_to_stand
 from magfusion.estimation.posterior.convergence import settled_at
 from magfusion.estimation.posterior.fixed_point_acceleration import Step, part_of_the_way
-from magfusion.estimation.posterior.noise_tuning import (
-    Tuned,
-    as_declared,
-    plausible,
-    with_noise,
-)
+from magfusion.estimation.posterior.noise_tuning import Tuned, as_declared, plausible, with_noise
 from magfusion.estimation.posterior.noise_tuning import has_converged as same_noise
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory

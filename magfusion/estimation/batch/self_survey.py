@@ -140,11 +140,7 @@ def _with_prior(placed: Beacon, declared: Beacon) -> Beacon:
 
 
 def decide(
-    log: Log,
-    site: Site,
-    settings: SmootherSettings,
-    report: Report,
-    result: list[Placement],
+    log: Log, site: Site, settings: SmootherSettings, report: Report, result: list[Placement]
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth the log with the most probable places; the whole graph decides between them.
 

@@ -200,11 +200,7 @@ def rows_at(tracks: Tracks, phasors: TrackPhasors, k: int) -> tuple[Array, Array
         reference_time=float(time),
     )
     value, by_pose, by_phase = linearize_channels(
-        known,
-        phasors.blocks,
-        np.full(len(tracks), time),
-        tracks.rotation,
-        tracks.position,
+        known, phasors.blocks, np.full(len(tracks), time), tracks.rotation, tracks.position
     )
     back = np.swapaxes(tracks.rotation, 1, 2)[:, None]
     none = np.zeros((*value.shape, 9))

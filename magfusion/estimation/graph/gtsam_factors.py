@@ -158,10 +158,7 @@ def fill(jacobians: list[Array], parts: Sequence[Array]) -> None:
 
 
 def whitened_factor(
-    keys: Sequence[int],
-    rows: int,
-    error: ErrorFunction,
-    like: gtsam.noiseModel.Base | None = None,
+    keys: Sequence[int], rows: int, error: ErrorFunction, like: gtsam.noiseModel.Base | None = None
 ) -> gtsam.NoiseModelFactor:
     """Return a factor of a whitened error, computed by a callback of GTSAM's form.
 
@@ -236,9 +233,7 @@ class EpochRows:
 
 
 def measurement_factors(
-    measurement: Measurement,
-    keys: CalibrationKeys,
-    values: gtsam.Values,
+    measurement: Measurement, keys: CalibrationKeys, values: gtsam.Values
 ) -> Iterator[gtsam.NoiseModelFactor]:
     """Yield a factor of every group of rows of every epoch that carries information.
 

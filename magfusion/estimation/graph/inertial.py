@@ -14,13 +14,7 @@ from magfusion.estimation.graph.preintegration import (
     preintegrate,
 )
 from magfusion.estimation.graph.state import MOTION
-from magfusion.model.parameters import (
-    Block,
-    Calibration,
-    dimension,
-    inertial_blocks,
-    retract,
-)
+from magfusion.model.parameters import Block, Calibration, dimension, inertial_blocks, retract
 from magfusion.model.platform_motion import HeldModel
 from magfusion.model.site import Platform, Site
 from magfusion.units import Array

@@ -67,11 +67,7 @@ def cut_at_epochs(
         silent = np.flatnonzero(in_gap(time, grid, known))
         gap_bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(
-        mean[:, :3].copy(),
-        mean[:, 3:].copy(),
-        grid[1:] - grid[:-1],
-        first,
-        gap_bridged,
+        mean[:, :3].copy(), mean[:, 3:].copy(), grid[1:] - grid[:-1], first, gap_bridged
     )
 
 

@@ -6,12 +6,7 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.imu_decimation import thinned
-from magfusion.estimation.graph.inertial import (
-    Link,
-    Steps,
-    inertial_factor,
-    links_between,
-)
+from magfusion.estimation.graph.inertial import Link, Steps, inertial_factor, links_between
 from magfusion.estimation.graph.preintegration import cut_at_epochs
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.state import MOTION, State, values_from

@@ -237,11 +237,7 @@ def _throughout(case: Case, information: Array, gradient: Array) -> float:
         for fault in suspects(case.result.declared.site, case.score.fixed)
         if (
             result := release_fault(
-                case.pose_cov,
-                case.score,
-                fault,
-                information[own, own],
-                gradient[own],
+                case.pose_cov, case.score, fault, information[own, own], gradient[own]
             )
         )
         is not None

@@ -76,8 +76,7 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
         whole = known.of(way.site)
         if one.samples is inverted:
             whole = replace(
-                one,
-                samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor),
+                one, samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor)
             )
         yield Explanation(
             way.code,
@@ -173,10 +172,7 @@ def _ways(site: Site) -> Iterator[Way]:
             _every(site, partial(scaled, factor=1.0 / factor)),
         )
     for words, factor in LENGTH_FACTORS.items():
-        yield Way(
-            *length_cause(words),
-            _every(site, partial(_placed, axes=factor * np.eye(3))),
-        )
+        yield Way(*length_cause(words), _every(site, partial(_placed, axes=factor * np.eye(3))))
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         yield Way(
             "angle_convention",

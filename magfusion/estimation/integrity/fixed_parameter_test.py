@@ -10,21 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.data_checks.statistics import (
-    sigmas,
-)
+from magfusion.estimation.data_checks.statistics import sigmas
 from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-)
-from magfusion.estimation.integrity.suspects import (
-    STRETCH,
-    TILT,
-    Suspect,
-    suspects,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
+from magfusion.estimation.integrity.suspects import STRETCH, TILT, Suspect, suspects
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, prior_sigma
 from magfusion.model.site import Site

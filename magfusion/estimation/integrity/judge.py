@@ -27,12 +27,7 @@ from magfusion.estimation.integrity.residual_blocks import (
     inertial,
     together,
 )
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-    scores_of,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate, scores_of
 from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise

@@ -36,9 +36,7 @@ class Deviation(NamedTuple):
 
 
 def agreement(
-    shared: Shared,
-    names: Sequence[str],
-    deviations: Callable[[list[int]], Sequence[Deviation]],
+    shared: Shared, names: Sequence[str], deviations: Callable[[list[int]], Sequence[Deviation]]
 ) -> LogAgreement:
     """Test every log against the others; report those that contradict, the largest first.
 

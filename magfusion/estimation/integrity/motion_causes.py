@@ -13,12 +13,7 @@ from magfusion.estimation.integrity.corrected_site import (
     with_magnetometer,
 )
 from magfusion.estimation.integrity.explanation import Explanation
-from magfusion.estimation.integrity.motion_comparison import (
-    SHARED,
-    Compared,
-    Surveyed,
-    compared,
-)
+from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
 from magfusion.model.samples import ImuSamples
@@ -214,9 +209,7 @@ def _accel_scaled(known: Compared, before: float, site: Site) -> Iterator[Explan
     )
 
 
-def _axes(
-    tried: Callable[[str, str, str, Array, Array], Explanation],
-) -> Iterator[Explanation]:
+def _axes(tried: Callable[[str, str, str, Array, Array], Explanation]) -> Iterator[Explanation]:
     for axes in _signed_permutations():
         words = _named(axes)
         if np.allclose(axes, EYE):

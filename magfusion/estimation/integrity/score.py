@@ -34,14 +34,7 @@ from magfusion.estimation.posterior.marginals import is_chain
 from magfusion.estimation.posterior.native_rows import NativeRows
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.estimation.solve.sparse_rows import sparse_if_wide
-from magfusion.model.parameters import (
-    Block,
-    Calibration,
-    dimension,
-    placed,
-    prior_sigma,
-    retract,
-)
+from magfusion.model.parameters import Block, Calibration, dimension, placed, prior_sigma, retract
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array

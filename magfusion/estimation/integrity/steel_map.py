@@ -16,12 +16,7 @@ from scipy.linalg import block_diag
 from magfusion.estimation.batch.batch import Smoothed, solved_again
 from magfusion.estimation.graph.graph import read_states
 from magfusion.estimation.integrity.fixed_parameter_test import MARGIN
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-    scores_of,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate, scores_of
 from magfusion.estimation.integrity.smoothed_exclusion import without_beacon
 from magfusion.estimation.integrity.steel_test import (
     STEEL,

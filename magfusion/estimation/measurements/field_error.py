@@ -47,12 +47,7 @@ class FieldError(BeaconParameter):
     group = kind = "field_error"
 
     def __init__(
-        self,
-        time: Array,
-        modes: Array,
-        relative: Array,
-        sensor_from_world: Array,
-        combine: Array,
+        self, time: Array, modes: Array, relative: Array, sensor_from_world: Array, combine: Array
     ) -> None:
         self._time, self._modes, self._combine = time, modes, combine
         self._relative, self._sensor_from_world = relative, sensor_from_world

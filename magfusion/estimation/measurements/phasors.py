@@ -12,12 +12,7 @@ from magfusion.estimation.graph.state import State, States, pose_steps, states_o
 from magfusion.estimation.measurements.signs import whitened_along
 from magfusion.model.detection_range import are_many
 from magfusion.model.field import skew
-from magfusion.model.noise import (
-    paired_whitening,
-    sensor_positions,
-    stacked,
-    weighed_and_alone,
-)
+from magfusion.model.noise import paired_whitening, sensor_positions, stacked, weighed_and_alone
 from magfusion.model.parameters import (
     CLOCK_RATE,
     TIME_OFFSET,

@@ -27,10 +27,7 @@ class PoseFix(Measurement):
         return None if self.robust is None else Loss(self.robust)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate."""
         error, by_pose = np.empty((len(states), 6)), np.empty((len(states), 6, 6))

@@ -26,10 +26,7 @@ class ZeroRate(Measurement):
     sigma: Array  # (n,) (rad/s)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, one group of three."""
         weight = 1.0 / self.sigma[:, None, None]

@@ -26,16 +26,12 @@ class ZeroVelocity(Measurement):
     sigma: Array  # (n,) (m/s)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, one group of three."""
         weight = 1.0 / self.sigma[:, None, None]
         return Rows(
-            error=weight * states.velocity_world[:, None],
-            by_velocity=weight[..., None] * _EYE,
+            error=weight * states.velocity_world[:, None], by_velocity=weight[..., None] * _EYE
         )
 
 

@@ -22,12 +22,7 @@ from magfusion.estimation.graph.measurement import Measurement, joined
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.same_epoch import SAME_TIME
-from magfusion.estimation.graph.state import (
-    MOTION,
-    State,
-    moved_to,
-    values_of,
-)
+from magfusion.estimation.graph.state import MOTION, State, moved_to, values_of
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.online.window_prior import WindowPrior, triangular
 from magfusion.estimation.solve.bordered import eliminate_partial

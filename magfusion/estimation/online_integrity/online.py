@@ -17,10 +17,7 @@ from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
-from magfusion.estimation.online_integrity.imu_checks import (
-    judge_biases,
-    judge_gravity,
-)
+from magfusion.estimation.online_integrity.imu_checks import judge_biases, judge_gravity
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.parameters import (
     Block,

@@ -10,12 +10,7 @@ from magfusion.estimation.graph.state import GYRO_BIAS as OWN_GYRO_BIAS
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.orientation.filter import OrientationFilter
-from magfusion.estimation.orientation.layout import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
-    TURN,
-    Orientation,
-)
+from magfusion.estimation.orientation.layout import ACCEL_BIAS, GYRO_BIAS, TURN, Orientation
 from magfusion.estimation.orientation.remarks import current_findings, doubts, position_open
 from magfusion.estimation.orientation.stretch import (
     STEP,

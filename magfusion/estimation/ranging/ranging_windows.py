@@ -49,11 +49,7 @@ def the_rotor(site: Site) -> Beacon:
 
 
 def ranging_log(
-    log: Log,
-    site: Site,
-    window: float,
-    mains_hz: float = 50.0,
-    errors: DepthErrors = DepthErrors(),
+    log: Log, site: Site, window: float, mains_hz: float = 50.0, errors: DepthErrors = DepthErrors()
 ) -> RangingLog:
     """Return the windows of a log.
 
@@ -136,9 +132,7 @@ def _followed(log: Log, beacon: Beacon) -> Array:
     parts = []
     for rows in np.split(np.arange(len(waveform)), cuts):
         own = replace(
-            waveform,
-            time=waveform.time[rows],
-            measured_sensor=waveform.measured_sensor[rows],
+            waveform, time=waveform.time[rows], measured_sensor=waveform.measured_sensor[rows]
         )
         parts.append(followed_angle(own, beacon.frequency_hz, rotor))
     return np.concatenate(parts)

@@ -50,11 +50,7 @@ def judged_fixes(
         for verdict, doubt in zip(states.verdict, doubtful.tolist(), strict=True)
     )
     findings = (*whole.findings, *_of_epochs(rival, open_pose, odd & ~bool(whole.findings)))
-    return (
-        replace(fixes, pose_cov=cov),
-        replace(states, verdict=verdicts),
-        Trust(findings),
-    )
+    return (replace(fixes, pose_cov=cov), replace(states, verdict=verdicts), Trust(findings))
 
 
 def _rival(fixes: Fixes) -> BoolArray:

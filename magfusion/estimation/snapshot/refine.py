@@ -13,13 +13,7 @@ from magfusion.estimation.snapshot.survey_error import honest_covariance, survey
 from magfusion.estimation.solve.batched import NormalEquations, minimise, open_inverse
 from magfusion.model.field import skew
 from magfusion.model.field_map import block_diagonal
-from magfusion.model.parameters import (
-    GAIN,
-    PHASE,
-    Calibration,
-    Parameter,
-    dimension,
-)
+from magfusion.model.parameters import GAIN, PHASE, Calibration, Parameter, dimension
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray

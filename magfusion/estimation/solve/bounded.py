@@ -21,10 +21,7 @@ DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems
 
 
 def minimise_bounded(
-    cost: Callable[[Array], float],
-    start: Array,
-    limits: Array,
-    decrease: float = DECREASE,
+    cost: Callable[[Array], float], start: Array, limits: Array, decrease: float = DECREASE
 ) -> Array:
     """Return the minimum of a cost by a quasi-Newton method (SciPy's L-BFGS-B).
 

@@ -7,10 +7,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 
 def nested_dissection(
-    epochs: int,
-    last: int | None,
-    segments: Sequence[tuple[int, int]] = (),
-    own: Sequence[int] = (),
+    epochs: int, last: int | None, segments: Sequence[tuple[int, int]] = (), own: Sequence[int] = ()
 ) -> gtsam.Ordering:
     """Return an elimination order of halves before their separators, the calibration last.
 

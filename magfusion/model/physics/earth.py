@@ -63,10 +63,7 @@ def gravity(latitude_deg: float, height_m: float) -> float:
 
 
 def east_north_up(
-    latitude_deg: float,
-    longitude_deg: float,
-    height_m: float,
-    origin: tuple[float, float, float],
+    latitude_deg: float, longitude_deg: float, height_m: float, origin: tuple[float, float, float]
 ) -> Array:
     """Return a position in the tangent plane of an origin, shape (3,) (m).
 

@@ -281,11 +281,7 @@ class SeveralArrivals(Arrivals):
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
         return side_by_side([result.get(k, none) for k in range(len(self.streams))], self.site)
 
-    def next_window(
-        self,
-        _state: State,
-        _needs_separate: Callable[[State], bool],
-    ) -> float | None:
+    def next_window(self, _state: State, _needs_separate: Callable[[State], bool]) -> float | None:
         """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]
