@@ -290,7 +290,8 @@ def driven_dipoles(
     """
     centre, moments = source.loops.centre, source.loops.moment
     if source.concentric:
-        moment, offset = current @ _of_matrices(moments), offset_beacon - centre[..., 0, :]
+        of_beacon = moments[..., 0, :, :] if moments.ndim > 2 else moments  # without points' axis
+        moment, offset = current @ of_beacon, offset_beacon - centre[..., 0, :]
         by = None if along_beacon is None else dipole_field_along(offset, moment, along_beacon)
         return Driven(dipole_field(offset, moment), by)
     moment, offset = current[..., None] * moments, offset_beacon[..., None, :] - centre
@@ -299,8 +300,3 @@ def driven_dipoles(
         return Driven(field, None)
     along = dipole_field_along(offset, moment, along_beacon[..., None, :])
     return Driven(field, np.sum(along, axis=-2))
-
-
-def _of_matrices(of_points: Array) -> Array:
-    """Return the array of each beacon's coils without the axis of its points."""
-    return of_points[..., 0, :, :] if of_points.ndim > 2 else of_points

@@ -79,15 +79,11 @@ def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
 
 def joined_phasors(separately: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
     """Return the phasors of the coils from those (..., tones, 3) at `points_apart`."""
-    return _joined_axes(separately, magnetometer)
+    return joined_axes(separately, magnetometer)
 
 
-def joined_samples(separately: list[Array], magnetometer: Magnetometer) -> Array:
-    """Return the samples of the coils from those (..., 3) at `points_apart`."""
-    return _joined_axes(separately, magnetometer)
-
-
-def _joined_axes(separately: Sequence[Any], magnetometer: Magnetometer) -> Any:
+def joined_axes(separately: Sequence[Any], magnetometer: Magnetometer) -> Any:
+    """Return the values (..., 3) of the coils from those at `points_apart`."""
     weights = _along(magnetometer)[1]
     count = len(weights)
     rows = [

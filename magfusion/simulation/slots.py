@@ -21,11 +21,6 @@ class Multiplexer:
     pause: float = 0.002  # maximum pause (s); each is drawn
 
 
-def is_multiplexed(site: Site) -> bool:
-    """Return whether bursts of the site's coils are not clocked."""
-    return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
-
-
 def draw_marks(
     site: Site, multiplexer: Multiplexer, duration: float, rng: np.random.Generator
 ) -> Marks:

@@ -154,7 +154,7 @@ def finding_of(
         cause.code,
         f"The log contradicts {cause.fault.name} as declared: {result}"
         f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
-        f" {_length(position)} and {rotation:.2g} deg,"
+        f" {100.0 * position:.2g} cm and {rotation:.2g} deg,"
         f" {np.sqrt(mean):.1f} times their reported sigma.{_alternatives(rivals)} {remedy}.",
         # A tilt is a rotation of the frame, whatever its size.
         Verdict.FAILED
@@ -188,10 +188,6 @@ def _amounts(site: Site, score: Score, cause: ReleasedFault, block: Block) -> st
         f" {step[i]:+.3g} ± {sigma[i]:.1g} {unit.text}".rstrip()
         for i in order.tolist()
     )
-
-
-def _length(metres: float) -> str:
-    return f"{100.0 * metres:.2g} cm"
 
 
 def _unverified(case: Case, score: Score) -> list[Unverified]:

@@ -35,15 +35,12 @@ class PoseFix(Measurement):
             fix = gtsam.Pose3(gtsam.Rot3(self.world_from_body[i]), self.position_world[i])
             pose = gtsam.Pose3(gtsam.Rot3(states.world_from_body[i]), states.position_world[i])
             separate = fix.between(pose)
-            error[i], by_pose[i] = gtsam.Pose3.Logmap(separate), _log_jacobian(separate)
+            error[i] = gtsam.Pose3.Logmap(separate)
+            by_pose[i] = gtsam.Pose3.LogmapDerivative(separate)
         return Rows(
             error=(self.sqrt_information @ error[..., None])[:, None, :, 0],
             by_pose=(self.sqrt_information @ by_pose)[:, None],
         )
-
-
-def _log_jacobian(pose: gtsam.Pose3) -> Array:
-    return gtsam.Pose3.LogmapDerivative(pose)
 
 
 def pose_fixes(fixes: Trajectory, robust: str | None = None) -> PoseFix:

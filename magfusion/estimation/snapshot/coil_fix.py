@@ -161,7 +161,7 @@ def _solved(problem: "_Problem", start: Array) -> _Refined:
         sign = np.ones_like(state)
         sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
         state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
-    there = epochs.channel_count * (2.0 if epochs.signed else 1.0)
+    there = np.sum(np.isfinite(epochs.measured), axis=1) * (2.0 if epochs.signed else 1.0)
     freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(problem.gain.sigma)))
     return _Refined(state, cov, cost, chi_square, determined.reshape(-1, count), freedom)
 

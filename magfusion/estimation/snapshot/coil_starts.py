@@ -65,11 +65,6 @@ class CoilEpochs:
         return CoilEpochs(*own, self.signed, self.parts, *motion)
 
     @property
-    def channel_count(self) -> IntArray:
-        """Number of channels in each row, shape (n,)."""
-        return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
-
-    @property
     def number_count(self) -> IntArray:
         """Number of real values in each row, shape (n,)."""
         parts = 1 if self.parts is None else self.parts
