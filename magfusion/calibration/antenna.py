@@ -62,9 +62,18 @@ def prior_sigma(
 ) -> Array:
     """Return prior standard deviations of `Antenna.vector`, shape (k,).
 
-    `antenna`: one; its moments and sensitivities give the scale. `gain`: relative, along each
-    coil's axis. `tilt`: across it (rad). `centre` (m). `kappa`: of the finite sizes (m^2); that of
-    coils of 3 cm radius.
+    Parameters
+    ----------
+    antenna : Antenna
+        One; its moments and sensitivities give the scale.
+    gain : float
+        Relative, along each coil's axis.
+    tilt : float
+        Across it (rad).
+    centre : float
+        (m)
+    kappa : float
+        Of the finite sizes (m^2); that of coils of 3 cm radius.
     """
     sigma = np.empty(antenna.vector().shape[-1])
     for columns, coils in (

@@ -33,14 +33,31 @@ def fit_at_uncertain_poses(
 ) -> AntennaFit:
     """Fit the antenna and all poses together.
 
-    `survey`: one survey; its poses are the means of their priors and the start. `start`: mean of
-    the prior. `sigma` (k,) or (k, k): of the prior (`magfusion.calibration.antenna.prior_sigma`),
-    or a factor of its covariance, which also fixes the gauges. `rotation_sigma`, `position_sigma`:
-    of each axis of a pose (rad, m). Infinite where the poses are unknown: then only the antenna's
-    shape is estimated, neither its frames nor its scale (self-calibration). `model`: predicts the
-    couplings. In the result ``dof`` counts couplings and, where known, poses less poses: the
-    couplings alone, or the couplings less six a pose. Raises EstimationError where it does not
-    converge.
+    Parameters
+    ----------
+    survey : AntennaSurvey
+        One survey; its poses are the means of their priors and the start.
+    start : Antenna
+        Mean of the prior.
+    sigma : ndarray, shape (k,) or (k, k)
+        Of the prior (`magfusion.calibration.antenna.prior_sigma`), or a factor of its covariance,
+        which also fixes the gauges.
+    rotation_sigma, position_sigma : float
+        Of each axis of a pose (rad, m).  Infinite where the poses are unknown: then only the
+        antenna's shape is estimated, neither its frames nor its scale (self-calibration).
+    model : callable
+        Predicts the couplings.
+
+    Returns
+    -------
+    AntennaFit
+        ``dof`` counts couplings and, where known, poses less poses: the couplings alone, or the
+        couplings less six a pose.
+
+    Raises
+    ------
+    EstimationError
+        Where it does not converge.
     """
     n, mean, root = len(survey.position_beacon), start.vector(), prior_root(sigma)
     weight = 1.0 / survey.sigma[:, None, None]

@@ -55,10 +55,17 @@ def observability(
 ) -> AntennaObservability:
     """Return the observability of the antennas from a survey, without any prior.
 
-    `survey`: one survey; its couplings are not used. `antenna`: linearisation point. Symmetric
-    opposites ((p, c, b) to -(p, c, b), (m, s) to -(m, s)) are beyond a linear analysis.
-    `attitudes_known`, `positions_known`: whether the survey provides the attitudes and positions of
-    its poses. `centred`: all coils of an antenna are at its origin; the centres are no parameters.
+    Parameters
+    ----------
+    survey : AntennaSurvey
+        One survey; its couplings are not used.
+    antenna : Antenna
+        Linearisation point.  Symmetric opposites ((p, c, b) to -(p, c, b), (m, s) to -(m, s)) are
+        beyond a linear analysis.
+    attitudes_known, positions_known : bool
+        Whether the survey provides the attitudes and positions of its poses.
+    centred : bool
+        All coils of an antenna are at its origin; the centres are no parameters.
     """
     free_parameters = ([] if attitudes_known else [0, 1, 2]) + (
         [] if positions_known else [3, 4, 5]

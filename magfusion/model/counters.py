@@ -11,9 +11,16 @@ NEAR_END, NEAR_SHARE = 1.0, 0.05  # s, of a period, at most; before and after it
 def lost_by_wrapping(raw: Array, last: float, wrapped: float, near_end: float = NEAR_END) -> Array:
     """Return what a counter has lost by wrapping (s), at each of its stamps.
 
-    `raw` (n,): stamps (s). `last`: the one before them; minus infinity before the first. `wrapped`:
-    what the counter had lost until then (s); a late stamp may be of before it wrapped. `near_end`:
-    as `NEAR_END` (s); more after a silence.
+    Parameters
+    ----------
+    raw : ndarray, shape (n,)
+        Stamps (s).
+    last : float
+        The one before them; minus infinity before the first.
+    wrapped : float
+        What the counter had lost until then (s); a late stamp may be of before it wrapped.
+    near_end : float
+        As `NEAR_END` (s); more after a silence.
     """
     step = np.diff(raw, prepend=last if np.isfinite(last) else raw[0])
     result = np.full(len(raw), wrapped)

@@ -117,9 +117,18 @@ def locate_slip(
 ) -> tuple[int, float]:
     """Return the first sample after a slip, and the part of amplitudes that is not smooth.
 
-    `samples` (n, columns): of the recording, among which it is. `first`: number of the first of
-    them. `missing`: number of the missing samples. `place` (m,): numbers on the true clock of the
-    amplitudes on both sides. `amplitude` (m, tones, columns): referred to the true clock.
+    Parameters
+    ----------
+    samples : ndarray, shape (n, columns)
+        Of the recording, among which it is.
+    first : int
+        Number of the first of them.
+    missing : int
+        Number of the missing samples.
+    place : ndarray, shape (m,)
+        Numbers on the true clock of the amplitudes on both sides.
+    amplitude : complex ndarray, shape (m, tones, columns)
+        Referred to the true clock.
     """
     middle = 0.5 * (place[0] + place[-1])
     unit = 0.5 * (place[-1] - place[0])

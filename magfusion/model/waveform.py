@@ -43,10 +43,25 @@ def predicted_waveform(
 ) -> tuple[Array, Array]:
     """Return the samples of a magnetometer along a motion.
 
-    `motion`: at the sample times. `earth_field_world` (3,) (T). `carrier` (n, channels): as of
-    `carriers`. `change`: derivative of the motion. `through_nodes`: whether expensive fields are
-    interpolated by `magfusion.model.path_field`. Returns (n, 3) (T), measured axes, without noise;
-    (n, 3): derivative of the samples; zero without a change.
+    Parameters
+    ----------
+    motion : Trajectory
+        At the sample times.
+    earth_field_world : ndarray, shape (3,)
+        (T)
+    carrier : complex ndarray, shape (n, channels)
+        As of `carriers`.
+    change : MotionChange, optional
+        Derivative of the motion.
+    through_nodes : bool
+        Whether expensive fields are interpolated by `magfusion.model.path_field`.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (T), measured axes, without noise.
+    ndarray, shape (n, 3)
+        Derivative of the samples; zero without a change.
     """
     factors = axis_factors(calibration.site)
     if factors is None:

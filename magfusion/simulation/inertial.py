@@ -57,12 +57,29 @@ def simulate_imu(
     """Return inertial samples: the exact values of one instant, bias and white noise.
 
     Samples are not averages over their interval; to integrate them, treat them as points of a
-    smooth curve.  Noise is discretised as GTSAM's preintegration assumes: white noise of density *
-    sqrt(rate), walk steps of walk / sqrt(rate). `imu`: its noise; its clock is not used.
-    `gravity` (m/s^2). `duration` (s); stamps run from 0 to less than this. `time_offset`: offset
-    (s) of the first sample: stamped t, it is taken at t + time_offset on the log's clock.
-    `instability`: added to the bias walk. `clock_rate`: rate of change of the time offset (s/s).
-    Raises InputError if there is no sample.
+    smooth curve.  Noise is discretised as GTSAM's preintegration assumes: white noise of
+    density * sqrt(rate), walk steps of walk / sqrt(rate).
+
+    Parameters
+    ----------
+    imu : ImuModel
+        Its noise; its clock is not used.
+    gravity : float
+        (m/s^2)
+    duration : float
+        (s); stamps run from 0 to less than this.
+    time_offset : float
+        Offset (s) of the first sample: stamped t, it is taken at t + time_offset on the log's
+        clock.
+    instability : BiasInstability, optional
+        Added to the bias walk.
+    clock_rate : float
+        Rate of change of the time offset (s/s).
+
+    Raises
+    ------
+    InputError
+        If there is no sample.
     """
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
     if not rate_hz > 0.0 or count < 1:

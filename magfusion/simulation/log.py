@@ -225,11 +225,24 @@ def simulate_fields(
 ) -> FieldSamples:
     """Return phasors with white noise directly, without a waveform and its receiver.
 
-    `site`: the true site. `trajectory`: one epoch each (time and pose). `sigma`: standard deviation
-    of each component's real, and imaginary, part (T). `drives`: by default as the site declares.
-    `window`: window length of the samples (s); the field is instantaneous. `spheres`: iron in the
-    room. `layers`: of the ground, instead of the full space of the site. `bending`: of each
-    beacon's field.
+    Parameters
+    ----------
+    site : Site
+        The true site.
+    trajectory : Trajectory
+        One epoch each (time and pose).
+    sigma : float
+        Standard deviation of each component's real, and imaginary, part (T).
+    drives : Drives, optional
+        By default as the site declares.
+    window : float
+        Window length of the samples (s); the field is instantaneous.
+    spheres : Spheres, optional
+        Iron in the room.
+    layers : Layers, optional
+        Of the ground, instead of the full space of the site.
+    bending : Bending, optional
+        Of each beacon's field.
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time

@@ -42,13 +42,32 @@ def run_many(
     """Run a task on every input, each with its own random generator.
 
     The generators are spawned from ``seed`` by the index of the input, so that results depend
-    neither on the number of workers nor on where they run. `task`: function of an input and a
-    Generator, defined at the top of a module; a block of runs in one call reduces the overhead.
-    `cluster`: address of a Dask scheduler (``tcp://host:8786``) whose workers have magfusion
-    installed. `workers`: processes on this machine, all cores by default; one runs the tasks in
-    this process. `report`: called with the stage, the number of finished tasks and of all tasks.
-    Returned in the order of ``inputs``. Raises InputError where the cluster cannot be used, or
-    ``workers`` is below one; EstimationError where a process of this machine was killed.
+    neither on the number of workers nor on where they run.
+
+    Parameters
+    ----------
+    task : callable
+        Function of an input and a Generator, defined at the top of a module; a block of runs in
+        one call reduces the overhead.
+    inputs : sequence
+    cluster : str, optional
+        Address of a Dask scheduler (``tcp://host:8786``) whose workers have magfusion installed.
+    workers : int, optional
+        Processes on this machine, all cores by default; one runs the tasks in this process.
+    report : callable, optional
+        Called with the stage, the number of finished tasks and of all tasks.
+
+    Returns
+    -------
+    list
+        In the order of ``inputs``.
+
+    Raises
+    ------
+    InputError
+        Where the cluster cannot be used, or ``workers`` is below one.
+    EstimationError
+        Where a process of this machine was killed.
     """
     with worker_pool(len(inputs), cluster=cluster, workers=workers) as hands:
         return hands.run(task, inputs, seed=seed, report=report)

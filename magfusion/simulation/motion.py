@@ -100,11 +100,23 @@ def random_walk_motion(
 ) -> SimulatedMotion:
     """Return a smooth random walk inside a box, as of a person or a robot that carries the body.
 
-    `duration` (s). `box_world` (2, 3): lower and upper corner (m) of the path's bounds. `speed`:
-    approximate mean speed while moving (m/s); lower where the box is small, to stay smooth.
-    `tilt_rms`: of the angle between the body's z axis and the vertical (rad), approximate.
-    `heading_rate_rms`: approximate (rad/s). Raises InputError if the box, the duration or the speed
-    is invalid.
+    Parameters
+    ----------
+    duration : float
+        (s)
+    box_world : ndarray, shape (2, 3)
+        Lower and upper corner (m) of the path's bounds.
+    speed : float
+        Approximate mean speed while moving (m/s); lower where the box is small, to stay smooth.
+    tilt_rms : float
+        Of the angle between the body's z axis and the vertical (rad), approximate.
+    heading_rate_rms : float
+        Approximate (rad/s).
+
+    Raises
+    ------
+    InputError
+        If the box, the duration or the speed is invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests())
     tilt = rng.normal(0.0, tilt_rms / np.sqrt(2.0), (len(knots), 3)) * [1.0, 1.0, 0.0]

@@ -68,14 +68,33 @@ def simulate_waveform(
 ) -> Waveform:
     """Return the field of all sources at each sample's own pose, as measured.
 
-    `site`: the true site. A missing Earth field is zero. `rate_hz`: more than 2.5 samples in the
-    fastest cycle. `duration` (s). `mains`: its phases are drawn. Harmonics beyond half the rate
-    alias, as in an instrument that does not filter. `quantisation`: step of the instrument (T).
-    `ambient`: iron, bending, noise and drift of the room. `marks`: when the coils of unclocked
-    slots are driven. `own`: of the instrument's noise; without it all is drawn from one. `begin`:
-    first stamp (s): days are simulated a minute at a time. Raises InputError if the rate is too low
-    for the tones or slots, coils are driven in time slots whose schedule the site does not declare,
-    or the motion leads through iron.
+    Parameters
+    ----------
+    site : Site
+        The true site.  A missing Earth field is zero.
+    rate_hz : float
+        More than 2.5 samples in the fastest cycle.
+    duration : float
+        (s)
+    mains : Mains, optional
+        Its phases are drawn.  Harmonics beyond half the rate alias, as in an instrument that
+        does not filter.
+    quantisation : float, optional
+        Step of the instrument (T).
+    ambient : Ambient, optional
+        Iron, bending, noise and drift of the room.
+    marks : Marks, optional
+        When the coils of unclocked slots are driven.
+    own : Generator, optional
+        Of the instrument's noise; without it all is drawn from one.
+    begin : float
+        First stamp (s): days are simulated a minute at a time.
+
+    Raises
+    ------
+    InputError
+        If the rate is too low for the tones or slots, coils are driven in time slots whose schedule
+        the site does not declare, or the motion leads through iron.
     """
     _check_tones(site, rate_hz, marks, drives)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))

@@ -67,12 +67,23 @@ def recorded(
 ) -> tuple[Finding, ...]:
     """Return the findings on a recording; without a site, on the streams alone.
 
-    `gap_bridged`: codes of the findings that the estimator handles. `poses`: by the beacons: they
-    decide which of vertical and field is wrong. `estimated`: by an estimator that also used
-    gravity; decides the cause of a reversed vertical. `beacons`: whether the result depends on the
-    beacons: if so, their reception and undeclared lines are reported. `detection`: their reception,
-    if already known. `lockin`: as requested. `compensated`: their reception by a solution, with the
-    motion inside the windows compensated.
+    Parameters
+    ----------
+    gap_bridged : collection of str
+        Codes of the findings that the estimator handles.
+    poses : Trajectory, optional
+        By the beacons: they decide which of vertical and field is wrong.
+    estimated : Trajectory, optional
+        By an estimator that also used gravity; decides the cause of a reversed vertical.
+    beacons : bool
+        Whether the result depends on the beacons: if so, their reception and undeclared lines
+        are reported.
+    detection : BeaconDetection, optional
+        Their reception, if already known.
+    lockin : LockinSettings, optional
+        As requested.
+    compensated : Detected, optional
+        Their reception by a solution, with the motion inside the windows compensated.
     """
     result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
     log = beginning(log)

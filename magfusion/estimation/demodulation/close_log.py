@@ -68,9 +68,17 @@ class CloseLog(NamedTuple):
     ) -> JointPhasors:
         """Return the measurement by the short windows.
 
-        `unexplained_sensor` (samples, 3): samples minus their prediction along the states (T).
-        `nodes`: the motion at `nodes`. `states`: at all epochs, which include the centres of the
-        windows. `imu`: as corrected by the calibration. `standing` (states,).
+        Parameters
+        ----------
+        unexplained_sensor : ndarray, shape (samples, 3)
+            Samples minus their prediction along the states (T).
+        nodes : Trajectory
+            The motion at `nodes`.
+        states : Trajectory
+            At all epochs, which include the centres of the windows.
+        imu : ImuSamples
+            As corrected by the calibration.
+        standing : bool ndarray, shape (states,), optional
         """
         assert states.gyro_bias_body is not None
         centre = self.windows.centre

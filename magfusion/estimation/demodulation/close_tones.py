@@ -42,14 +42,34 @@ def joint_phasors(
 ) -> tuple[JointPhasors, Array]:
     """Return the joint phasors of all tones in short windows, weighted at approximate poses.
 
-    `time` (samples,) (s). `left_sensor` (samples, 3): samples minus their prediction (T), measured
-    axes. `states`: predicted, at the centres of the windows. `nodes`: predicted, at the nodes of
-    the windows. `imu`: as from `magfusion.receiver.turn.on_clock`, without the gyro's bias.
-    `epoch` (n,): state index of each window. `rate_body` (n, 3): angular rate without its bias
-    (rad/s). `applied_offset` (n,): IMU time offset with which the inertial data were cut (s).
-    `shared_by`, `standing`: as of `magfusion.estimation.measurements.phasors.field_phasors`.
-    `noise` (k, 3, 3): sample noise of the windows before, for the average. Returns (n, 3, 3):
-    sample noise estimated from each window alone (T^2).
+    Parameters
+    ----------
+    time : ndarray, shape (samples,)
+        (s)
+    left_sensor : ndarray, shape (samples, 3)
+        Samples minus their prediction (T), measured axes.
+    states : Trajectory
+        Predicted, at the centres of the windows.
+    nodes : Trajectory
+        Predicted, at the nodes of the windows.
+    imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`, without the gyro's bias.
+    epoch : int ndarray, shape (n,)
+        State index of each window.
+    rate_body : ndarray, shape (n, 3)
+        Angular rate without its bias (rad/s).
+    applied_offset : ndarray, shape (n,)
+        IMU time offset with which the inertial data were cut (s).
+    shared_by, standing
+        As of `magfusion.estimation.measurements.phasors.field_phasors`.
+    noise : ndarray, shape (k, 3, 3), optional
+        Sample noise of the windows before, for the average.
+
+    Returns
+    -------
+    JointPhasors
+    ndarray, shape (n, 3, 3)
+        Sample noise estimated from each window alone (T^2).
     """
     assert states.velocity_world is not None
     site, n = calibration.site, len(windows)

@@ -87,9 +87,18 @@ def taken_off(
 ) -> TakenOff:
     """Return the residuals of samples after a prediction along a motion.
 
-    `path`: states between which the motion is interpolated by the IMU. `time_offset`: of the IMU
-    (s). `window`: window length (s) that sets which beacons are predicted. `wanted` (m,): other
-    requested times of the motion (s). `known`: the motion, if known.
+    Parameters
+    ----------
+    path : Trajectory
+        States between which the motion is interpolated by the IMU.
+    time_offset : float
+        Of the IMU (s).
+    window : float
+        Window length (s) that sets which beacons are predicted.
+    wanted : ndarray, shape (m,), optional
+        Other requested times of the motion (s).
+    known : KnownMotion, optional
+        The motion, if known.
     """
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
@@ -136,10 +145,19 @@ def demodulate_about(
 
     The raw samples of each window are predicted from the state and the IMU's motion inside the
     window; only the difference to the measured samples passes through the lock-in.
-    `measured_sensor` (samples, 3) (T). `states`: at the centres of the windows. `path`: states
-    between which the motion is interpolated, where these are not those of the windows.
-    `wanted` (m,): other times of the motion (s); with them the residuals are returned too.
-    `motion`: along the samples, if known.
+
+    Parameters
+    ----------
+    measured_sensor : ndarray, shape (samples, 3)
+        (T)
+    states : Trajectory
+        At the centres of the windows.
+    path : Trajectory, optional
+        States between which the motion is interpolated, where these are not those of the windows.
+    wanted : ndarray, shape (m,), optional
+        Other times of the motion (s); with them the residuals are returned too.
+    motion : KnownMotion, optional
+        Along the samples, if known.
     """
     # The field of steel varies within a window by some ten-thousandths of that of the beacons.
     calibration = replace(calibration, site=calibration.site.without_steel())
@@ -217,11 +235,20 @@ def demodulate_predicted(
 ) -> MotionCompensated:
     """Demodulate one window about a predicted state.
 
-    `number`: of the window. `waveform`, `imu`: covering the window and, of the IMU, the interval
-    before it. `before`, `predicted`: at the epoch before and at the centre. `offset`: IMU time
-    offset with which the states were propagated (s). `blind`: whether other samples replace
-    inertial ones. `is_lost`: whether the predicted position is unknown, so that it does not assign
-    phasors to beacons.
+    Parameters
+    ----------
+    number : int
+        Of the window.
+    waveform, imu : Waveform, ImuSamples
+        Covering the window and, of the IMU, the interval before it.
+    before, predicted : State
+        At the epoch before and at the centre.
+    offset : float
+        IMU time offset with which the states were propagated (s).
+    blind : bool
+        Whether other samples replace inertial ones.
+    is_lost : bool
+        Whether the predicted position is unknown, so that it does not assign phasors to beacons.
     """
     assert receiver.grid is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)

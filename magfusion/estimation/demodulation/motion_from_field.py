@@ -101,9 +101,16 @@ def motion_from_field(
 ) -> FieldMotion | None:
     """Return the motion of the platform from magnetometer samples; None where undetermined.
 
-    `state`: at or before the first sample. `waveform`: following samples. `imu`: available samples
-    of the same interval, on the log's clock. `longest_step`: between two inertial samples (s); a
-    longer one is a gap.
+    Parameters
+    ----------
+    state : State
+        At or before the first sample.
+    waveform : Waveform
+        Following samples.
+    imu : ImuSamples, optional
+        Available samples of the same interval, on the log's clock.
+    longest_step : float
+        Between two inertial samples (s); a longer one is a gap.
     """
     time, calibration = waveform.time, state.calibration
     if len(time) < MIN_SAMPLES:

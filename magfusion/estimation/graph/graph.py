@@ -249,10 +249,16 @@ class Graph:
     ) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at an estimate with the columns of fixed parameters.
 
-        `spread` (dimension, columns): maps each column to a step of the parameters.
-        `by_others` (intervals, 15, columns): their effect on the inertial factors, whitened.
-        `explaining`: with the residuals as right-hand side, which is zero otherwise. `nuisance`:
-        other uncertain parameters, as the variable `NUISANCE_KEY` with its prior.
+        Parameters
+        ----------
+        spread : ndarray, shape (dimension, columns)
+            Maps each column to a step of the parameters.
+        by_others : ndarray, shape (intervals, 15, columns), optional
+            Their effect on the inertial factors, whitened.
+        explaining : bool
+            With the residuals as right-hand side, which is zero otherwise.
+        nuisance : tuple of Block
+            Other uncertain parameters, as the variable `NUISANCE_KEY` with its prior.
         """
         graph = self.inertial(estimate, by_others)
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):

@@ -63,11 +63,27 @@ def preintegrate_stream(
 ) -> tuple[list[gtsam.PreintegratedCombinedMeasurementsG], BoolArray]:
     """Preintegrate a whole stream between epochs, in segments.
 
-    `time_offset`: added to its stamps to bring them to the log's clock (s). `epochs` (n,) (s),
-    `gravity` (m/s^2). `accel_bias`, `gyro_bias` (n, 3): at which to linearise (m/s^2, rad/s).
-    `silence`: beginnings and ends of gaps that are filled by other samples (s). `roughly`: whether
-    approximate sigmas suffice, so that intervals of some tens of samples are decimated. Returns one
-    for each interval; (n - 1,): intervals with a gap.
+    Parameters
+    ----------
+    time_offset : float
+        Added to its stamps to bring them to the log's clock (s).
+    epochs : ndarray, shape (n,)
+        (s)
+    gravity : float
+        (m/s^2)
+    accel_bias, gyro_bias : ndarray, shape (n, 3)
+        At which to linearise (m/s^2, rad/s).
+    silence : tuple of ndarray, optional
+        Beginnings and ends of gaps that are filled by other samples (s).
+    roughly : bool
+        Whether approximate sigmas suffice, so that intervals of some tens of samples are decimated.
+
+    Returns
+    -------
+    list
+        One for each interval.
+    bool ndarray, shape (n - 1,)
+        Intervals with a gap.
     """
     before = np.searchsorted(imu.time, epochs - time_offset)
     usual = float(np.median(np.diff(imu.time + time_offset)))
@@ -195,10 +211,21 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     """Return two steps with the same integral as many.
 
     Constant over each step, they give the rotations of the halves, and together velocity and
-    position of the whole. `steps` (7, k, 2, n): rate, specific force and length of the single steps
-    of both halves. `bias` (6, n): of gyro and accelerometer (rad/s, m/s^2). Returns
-    `both` (7, 2, n): rate, specific force and length; `gentle` (n,): whether the rotation of both
-    halves is small.
+    position of the whole.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (7, k, 2, n)
+        Rate, specific force and length of the single steps of both halves.
+    bias : ndarray, shape (6, n)
+        Of gyro and accelerometer (rad/s, m/s^2).
+
+    Returns
+    -------
+    both : ndarray, shape (7, 2, n)
+        Rate, specific force and length.
+    gentle : ndarray of bool, shape (n,)
+        Whether the rotation of both halves is small.
     """
     single, angle = _of_steps(steps, bias)
     halves = _one_after_the_other(single)

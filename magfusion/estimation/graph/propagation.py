@@ -47,11 +47,26 @@ def propagate(
     """Propagate a state to a later time.
 
     Transition and noise are those of the graph's own inertial factor, so that a filter built on
-    this and the graph agree to round-off. `imu`: covering the interval; where it does not, its end
-    values are extended. `time` (s). `site`: its IMU's noise and its gravity. `time_offset`: added
-    to the IMU's stamps (s). `process_noise`: of the calibration. `usual`: sampling interval of the
-    IMU (s), as in `cut_at_epochs`. `blocks`: calibration parameters in the state's tangent.
-    `blind`: whether other samples replace inertial ones: they have the noise of a gap.
+    this and the graph agree to round-off.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        Covering the interval; where it does not, its end values are extended.
+    time : float
+        (s)
+    site : Site
+        Its IMU's noise and its gravity.
+    time_offset : float
+        Added to the IMU's stamps (s).
+    process_noise : ProcessNoise, optional
+        Of the calibration.
+    usual : float, optional
+        Sampling interval of the IMU (s), as in `cut_at_epochs`.
+    blocks : tuple of Block
+        Calibration parameters in the state's tangent.
+    blind : bool
+        Whether other samples replace inertial ones: they have the noise of a gap.
     """
     epochs = np.array([state.time, time])
     accel, gyro = state.accel_bias_body, state.gyro_bias_body

@@ -103,10 +103,20 @@ def find_online_start(
 ) -> OnlineStart | NoStart:
     """Return the state at the last epoch before a time; or the reason why there is none.
 
-    `fields`: one epoch each; used where present. `steady`: of the same epochs as ``fields``.
-    `until` (s). `marks`: times at which each coil was driven, where the site's slots are marked.
-    `waveforms`: the samples of several magnetometers until then, each on its own clock. `diagnose`:
-    whether to look for mistakes of the site where a start is doubtful.
+    Parameters
+    ----------
+    fields : list of FieldSamples
+        One epoch each; used where present.
+    steady : list of SteadyFields
+        Of the same epochs as ``fields``.
+    until : float
+        (s)
+    marks : Marks, optional
+        Times at which each coil was driven, where the site's slots are marked.
+    waveforms : mapping, optional
+        The samples of several magnetometers until then, each on its own clock.
+    diagnose : bool
+        Whether to look for mistakes of the site where a start is doubtful.
     """
     if not fields:
         receiver = receiver_of(site, settings.lockin)

@@ -87,9 +87,16 @@ class Compared:
     ) -> tuple[float, Array]:
         """Return chi square and the shared parameters for assumed axes.
 
-        `gyro_axes`, `accel_axes` (3, 3): from a reading to body axes and SI units. `parameters`:
-        which of `SHARED` has no prior. `gravity`: share of gravity that the specific force
-        contains. `lever` (3,): by which the declared lever arm is too long (m).
+        Parameters
+        ----------
+        gyro_axes, accel_axes : ndarray, shape (3, 3)
+            From a reading to body axes and SI units.
+        parameters : str, optional
+            Which of `SHARED` has no prior.
+        gravity : float
+            Share of gravity that the specific force contains.
+        lever : ndarray, shape (3,), optional
+            By which the declared lever arm is too long (m).
         """
         by_gyro = self.gyro_turned @ gyro_axes.T
         turns = np.zeros((len(by_gyro), 3, WIDTH))

@@ -99,9 +99,18 @@ def earth_measurement(
 ) -> EarthField:
     """Return steady fields as a measurement.
 
-    `steady`: NaN where missing. `epoch` (n,): indices of their states. `rate_body` (n, 3): without
-    the gyro's bias (rad/s). `applied_offset` (n,): IMU time offset used to cut the inertial data
-    (s). `step`: time between epochs (s).
+    Parameters
+    ----------
+    steady : SteadyFields
+        NaN where missing.
+    epoch : int ndarray, shape (n,)
+        Indices of their states.
+    rate_body : ndarray, shape (n, 3)
+        Without the gyro's bias (rad/s).
+    applied_offset : ndarray, shape (n,)
+        IMU time offset used to cut the inertial data (s).
+    step : float
+        Time between epochs (s).
     """
     repeats = max(1.0, AMBIENT_TIME / step)
     there = np.isfinite(steady.measured_sensor)
@@ -169,8 +178,16 @@ def unobserved_constraints(
 ) -> list[Measurement]:
     """Constrain what no beacon determines: the speed, and if necessary one position.
 
-    `states`: approximate states. `epoch` (n,): of the fields. `detected` (n,): whether a beacon was
-    detected at each. `step`: time between epochs (s).
+    Parameters
+    ----------
+    states : Trajectory
+        Approximate states.
+    epoch : int ndarray, shape (n,)
+        Of the fields.
+    detected : bool ndarray, shape (n,)
+        Whether a beacon was detected at each.
+    step : float
+        Time between epochs (s).
     """
     free_parameters = epoch[~detected]
     out: list[Measurement] = []

@@ -37,11 +37,19 @@ class FieldError(BeaconParameter):
     """Amplitudes of one beacon's error: by component of it in world axes, and combination of modes.
 
     Iron responds to a field linearly, so that it adds a position-dependent matrix times the
-    beacon's field, equal for all its tones and in phase with each. `time` (n,): of the epochs
-    affected (s). `modes` (n, magnetometers, m): with unit variance in total.
-    `relative` (n, magnetometers, tones): magnitude of the error, relative to the field.
-    `sensor_from_world` (n, magnetometers, 3, 3). `combine` (m, 3, k): orthonormal combinations of
-    mode and component of the field, world axes.
+    beacon's field, equal for all its tones and in phase with each.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the epochs affected (s).
+    modes : ndarray, shape (n, magnetometers, m)
+        With unit variance in total.
+    relative : ndarray, shape (n, magnetometers, tones)
+        Magnitude of the error, relative to the field.
+    sensor_from_world : ndarray, shape (n, magnetometers, 3, 3)
+    combine : ndarray, shape (m, 3, k)
+        Orthonormal combinations of mode and component of the field, world axes.
     """
 
     group = kind = "field_error"

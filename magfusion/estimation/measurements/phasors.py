@@ -306,14 +306,26 @@ def field_phasors(
 ) -> FieldPhasors:
     """Return phasors as a measurement, weighted at approximate poses.
 
-    `epoch` (n,): indices of their states. `poses`: at the same epochs. `rate_body` (n, 3): angular
-    rate without its bias (rad/s). `applied_offset` (n,): IMU time offset used to cut the inertial
-    data (s). `repeats`: number of epochs that contain each sample of overlapping windows, to count
-    it once. `by_time_offset` (n, channels, 3): as of
-    `magfusion.estimation.demodulation.motion_compensation.WaveFields`. `shared_by` (n,), or float:
-    number of epochs with the same model error; at least the number of windows of a sample.
-    `standing` (n,): where the platform is known to be stationary. `others`: as of
-    `magfusion.model.noise.measurement_cov`.
+    Parameters
+    ----------
+    epoch : int ndarray, shape (n,)
+        Indices of their states.
+    poses : Trajectory
+        At the same epochs.
+    rate_body : ndarray, shape (n, 3)
+        Angular rate without its bias (rad/s).
+    applied_offset : ndarray, shape (n,)
+        IMU time offset used to cut the inertial data (s).
+    repeats : float
+        Number of epochs that contain each sample of overlapping windows, to count it once.
+    by_time_offset : complex ndarray, shape (n, channels, 3), optional
+        As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
+    shared_by : ndarray, shape (n,), or float
+        Number of epochs with the same model error; at least the number of windows of a sample.
+    standing : bool ndarray, shape (n,), optional
+        Where the platform is known to be stationary.
+    others : bool
+        As of `magfusion.model.noise.measurement_cov`.
     """
     place = sensor_positions(site, poses)
     together = np.maximum(shared_by, repeats)

@@ -69,9 +69,17 @@ class RelativePose(AidingMeasurement):
         """Return the measurement with the inertial samples of its intervals.
 
         One that lacks some of them, or is too long, is not measured: its sigmas are infinite.
-        `time_offset`: added to the stamps of the samples (s). `end` (n,): of the intervals (s).
-        `bias` (n, 6): at which to preintegrate, accelerometer first (m/s^2, rad/s). `usual`:
-        sampling interval (s); the median by default.
+
+        Parameters
+        ----------
+        time_offset : float
+            Added to the stamps of the samples (s).
+        end : ndarray, shape (n,)
+            Of the intervals (s).
+        bias : ndarray, shape (n, 6)
+            At which to preintegrate, accelerometer first (m/s^2, rad/s).
+        usual : float, optional
+            Sampling interval (s); the median by default.
         """
         begin, model = end - self.interval, site.platform.imu
         own = replace(

@@ -51,9 +51,16 @@ def with_signs(
 ) -> FieldSamples:
     """Return amplitudes with the phases predicted at poses, without those of open sign.
 
-    `samples`: with `FieldSamples.signed` False; their phases are ignored. `poses`: at the same
-    epochs; a covariance widens the range near zero. `first`: whether the poses are a first guess.
-    `every`: whether those near zero are included, to compare guesses by the same amplitudes.
+    Parameters
+    ----------
+    samples : FieldSamples
+        With `FieldSamples.signed` False; their phases are ignored.
+    poses : Trajectory
+        At the same epochs; a covariance widens the range near zero.
+    first : bool
+        Whether the poses are a first guess.
+    every : bool
+        Whether those near zero are included, to compare guesses by the same amplitudes.
     """
     if samples.signed:
         return samples

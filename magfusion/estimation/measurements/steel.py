@@ -152,8 +152,16 @@ def steel_modes(
 ) -> tuple[Block, ...]:
     """Return the block of steel's amplitudes for a log; none for what it does not model.
 
-    `time` (n,): of the fields (s). `poses`: poses at these times. `count`: number of modes of all
-    beacons together, and of each tone. `places`: on the path, at which they are determined.
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the fields (s).
+    poses : Trajectory
+        Poses at these times.
+    count : tuple of int
+        Number of modes of all beacons together, and of each tone.
+    places : int
+        On the path, at which they are determined.
     """
     if site.platform.further or not site.beacons or not 1 < len(time) <= MAX_EPOCHS:
         return ()

@@ -47,10 +47,16 @@ Estimator = SlidingWindow | ErrorStateFilter
 class EpochUpdate:
     """Processes epochs one by one.
 
-    `estimated`, `blocks`: calibration parameters that are estimated, and all in the states'
-    tangent. `earth`: whether the static field is a measurement. `lost_beyond`: as of
-    `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m). `bank`: filters that
-    exclude each beacon; without it there are no protection levels.
+    Parameters
+    ----------
+    estimated, blocks : tuple of Block
+        Calibration parameters that are estimated, and all in the states' tangent.
+    earth : bool
+        Whether the static field is a measurement.
+    lost_beyond : float
+        As of `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m).
+    bank : SubsetBank, optional
+        Filters that exclude each beacon; without it there are no protection levels.
     """
 
     gate: Gate

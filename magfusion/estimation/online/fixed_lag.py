@@ -46,10 +46,20 @@ class Node:
 class SlidingWindow:
     """Fixed-lag smoother.
 
-    `state`: initial state, with its covariance. `blocks`: calibration parameters in its tangent.
-    `lag`: length of the window (s). `process_noise`: of the calibration. `considered`: parameters
-    at the tangent's end that are considered, not estimated. `site`: noise of the IMU and gravity;
-    the state's by default.
+    Parameters
+    ----------
+    state : State
+        Initial state, with its covariance.
+    blocks : tuple of Block
+        Calibration parameters in its tangent.
+    lag : float
+        Length of the window (s).
+    process_noise : ProcessNoise
+        Of the calibration.
+    considered : int
+        Parameters at the tangent's end that are considered, not estimated.
+    site : Site, optional
+        Noise of the IMU and gravity; the state's by default.
     """
 
     state: State

@@ -82,10 +82,21 @@ def propagate_passage(
 ) -> tuple[Passage, Passage]:
     """Propagate a passage to some times, and to the newest inertial sample.
 
-    `last`: of one time: the end of the previous propagation. `imu`: including the one before that
-    time. `wanted` (n,): rising, not before the last time nor after the newest sample (s). `blind`:
-    whether samples are substitutes for inertial ones: they have the noise of a gap. Returned at
-    these times, and at the newest sample.
+    Parameters
+    ----------
+    last : Passage
+        Of one time: the end of the previous propagation.
+    imu : ImuSamples
+        Including the one before that time.
+    wanted : ndarray, shape (n,)
+        Rising, not before the last time nor after the newest sample (s).
+    blind : bool
+        Whether samples are substitutes for inertial ones: they have the noise of a gap.
+
+    Returns
+    -------
+    Passage, Passage
+        At these times, and at the newest sample.
     """
     begin, stamps = last.time[0], imu.time + start.time_offset
     grid = np.union1d(stamps[stamps > begin], np.append(wanted, begin))

@@ -54,10 +54,19 @@ MOST_WAITING = 10  # epochs; larger batches would delay an update
 class OnlineScore:
     """Score test of a running estimate's fixed parameters; of many beacons, of detected ones.
 
-    `estimated`, `considered`: calibration parameters in the state's tangent. `steady`: whether the
-    static field is measured. `correction`: of the cause in the last result, if there is one.
-    `named`: owners of the parameters in the last result: of the cause, and what explains it as
-    well.
+    Parameters
+    ----------
+    estimated, considered : tuple of Block
+        Calibration parameters in the state's tangent.
+    steady : bool
+        Whether the static field is measured.
+
+    Attributes
+    ----------
+    correction : Correction, optional
+        Of the cause in the last result, if there is one.
+    named : tuple of str
+        Owners of the parameters in the last result: of the cause, and what explains it as well.
     """
 
     _sums: Sums | None

@@ -21,9 +21,16 @@ from magfusion.units import Array, IntArray
 class ScoreTargets:
     """The fixed parameters that are tested, and their columns next to a state.
 
-    `site`: with the tested beacons. `estimated`, `considered`: calibration parameters in the
-    state's tangent, of all beacons. `steady`: whether the static field is measured. `steel`:
-    amplitudes of `magfusion.estimation.measurements.steel.region_modes`, tested last.
+    Parameters
+    ----------
+    site : Site
+        With the tested beacons.
+    estimated, considered : tuple of Block
+        Calibration parameters in the state's tangent, of all beacons.
+    steady : bool
+        Whether the static field is measured.
+    steel : tuple of Block
+        Amplitudes of `magfusion.estimation.measurements.steel.region_modes`, tested last.
     """
 
     def __init__(

@@ -107,11 +107,22 @@ def tune(
 ) -> tuple[Tuned, ...]:
     """Return the most probable noise for the residuals of a solved graph.
 
-    `samples`: as measured in the graph. `poses`: at the samples. `declared`: whose noise is the
-    prior. `windows`: number of windows that contain each sample. `shared_by` (n,): number of epochs
-    with the same model error. `blind` (n,): epochs with other noise: of a motion estimated without
-    an IMU. `considered`: parameters that are not estimated: the effect of their errors on residuals
-    is no noise.
+    Parameters
+    ----------
+    samples : FieldSamples
+        As measured in the graph.
+    poses : Trajectory
+        At the samples.
+    declared : Site
+        Whose noise is the prior.
+    windows : float
+        Number of windows that contain each sample.
+    shared_by : ndarray, shape (n,)
+        Number of epochs with the same model error.
+    blind : bool ndarray, shape (n,), optional
+        Epochs with other noise: of a motion estimated without an IMU.
+    considered : tuple of Block
+        Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
     draws = int(np.clip(DRAWN_EPOCHS // len(samples), 1, MAX_DRAWS))
     system = ResidualProjection(graph, estimate, samples, poses, windows, considered, draws=draws)

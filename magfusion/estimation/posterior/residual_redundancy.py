@@ -44,10 +44,21 @@ class ChannelErrors:
 class ResidualProjection:
     """The linear system of a solved graph, and the remainders of errors after its estimate.
 
-    `samples`: as measured in the graph. `poses`: at the samples. `windows`: number of windows that
-    contain each sample. `considered`: uncertain parameters that are not estimated elsewhere. Here
-    they are: the effect of their errors is no noise. `seed`: of the drawn errors. `draws`: number
-    of drawn errors of each kind.
+    Parameters
+    ----------
+    samples : FieldSamples
+        As measured in the graph.
+    poses : Trajectory
+        At the samples.
+    windows : float
+        Number of windows that contain each sample.
+    considered : tuple of Block
+        Uncertain parameters that are not estimated elsewhere.  Here they are: the effect of their
+        errors is no noise.
+    seed : int
+        Of the drawn errors.
+    draws : int
+        Number of drawn errors of each kind.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap

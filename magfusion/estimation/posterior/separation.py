@@ -174,10 +174,17 @@ def linear_separation(
 ) -> Separation:
     """Separate the estimates of linear least squares with whitened rows, independently by epoch.
 
-    `jacobian` (n, rows, 6 + nuisances): by the pose, then by the nuisances. Missing rows are zero.
-    `error` (n, rows): predicted minus measured. `covariance` (n, rows, rows): the rows' true
-    covariance, where their whitening is an approximation. `owner` (rows,): beacon of each row;
-    negative for rows of no beacon.
+    Parameters
+    ----------
+    jacobian : ndarray, shape (n, rows, 6 + nuisances)
+        By the pose, then by the nuisances.  Missing rows are zero.
+    error : ndarray, shape (n, rows)
+        Predicted minus measured.
+    covariance : ndarray, shape (n, rows, rows), optional
+        The rows' true covariance, where their whitening is an approximation.
+    owner : int ndarray, shape (rows,)
+        Beacon of each row; negative for rows of no beacon.
+    beacons : int
     """
     step, gain, _ = _estimate(jacobian, error)
     known = np.any(jacobian != 0.0, axis=2)

@@ -232,13 +232,29 @@ def maximize_likelihood(
 ) -> Array:
     """Return the logarithm of the factor of each part's standard deviation.
 
-    For each of k beacons, or other sources of separate residuals. `square` (k, m): squared norms of
-    residuals. `parts` (k, kinds, m): expected square of a component by each kind of noise, as
-    declared. `fixed` (k, m): expected square of a component by all other noise. `weight` (k, m):
-    share of each that is independent. `components`: of each residual. `kinds`: parts with one
-    declared sigma in total. The others have no declared sigma and may vanish. `near` (k, kinds):
-    estimate with other weights, where the search begins. A negligible part, where the cost has no
-    slope, begins as a small one, unless that were less probable. Returns (k, kinds).
+    For each of k beacons, or other sources of separate residuals.
+
+    Parameters
+    ----------
+    square : ndarray, shape (k, m)
+        Squared norms of residuals.
+    parts : ndarray, shape (k, kinds, m)
+        Expected square of a component by each kind of noise, as declared.
+    fixed : ndarray, shape (k, m)
+        Expected square of a component by all other noise.
+    weight : ndarray, shape (k, m)
+        Share of each that is independent.
+    components : int
+        Of each residual.
+    kinds : sequence of slice
+        Parts with one declared sigma in total.  The others have no declared sigma and may vanish.
+    near : ndarray, shape (k, kinds), optional
+        Estimate with other weights, where the search begins.  A negligible part, where the cost has
+        no slope, begins as a small one, unless that were less probable.
+
+    Returns
+    -------
+    ndarray, shape (k, kinds)
     """
     count = parts.shape[1]
     first, least, of_kind = _of_kinds(count, kinds)

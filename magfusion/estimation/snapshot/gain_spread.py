@@ -35,12 +35,24 @@ def gain_spread(
     """Return the standard deviation of the log-gains that maximises the evidence.
 
     The evidence of an epoch is its likelihood with pose and gains integrated out by Laplace's
-    method, with a flat prior of the pose.  A spread is accepted if it improves the evidence by more
-    than Schwarz's criterion requires for one more parameter. `samples`: channels in the site's
-    order. `fixes`: of these epochs, with fixed gains. `gravity`, `survey_error`: as in
-    `magfusion.estimation.snapshot.likelihood.fix_epochs`. `free_parameters`: other parameters
-    estimated with the pose. Returns zero if no spread is accepted; `GAIN_SIGMA` if there are too
-    few epochs.
+    method, with a flat prior of the pose.  A spread is accepted if it improves the evidence by
+    more than Schwarz's criterion requires for one more parameter.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Channels in the site's order.
+    fixes : Fixes
+        Of these epochs, with fixed gains.
+    gravity, survey_error
+        As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
+    free_parameters : tuple of str
+        Other parameters estimated with the pose.
+
+    Returns
+    -------
+    float
+        Zero if no spread is accepted; `GAIN_SIGMA` if there are too few epochs.
     """
     rows = np.flatnonzero(fixes.determined[:, 0])
     if len(rows) < MIN_EPOCHS:

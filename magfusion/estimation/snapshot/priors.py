@@ -42,9 +42,17 @@ def contradiction(
 ) -> Contradiction:
     """Test whether parameters deviate from their declared values by more than declared.
 
-    `names`: as the report has them. `change` (n,): estimated less declared. `change_cov`,
-    `prior_cov` (n, n): of the change, if the declared sigmas are right, and of the declared values;
-    parameters with zero prior variance are ignored. `remedy`: sentence that ends the reason.
+    Parameters
+    ----------
+    names : sequence of str
+        As the report has them.
+    change : ndarray, shape (n,)
+        Estimated less declared.
+    change_cov, prior_cov : ndarray, shape (n, n)
+        Of the change, if the declared sigmas are right, and of the declared values; parameters
+        with zero prior variance are ignored.
+    remedy : str
+        Sentence that ends the reason.
     """
     prior = np.sqrt(np.diagonal(prior_cov))
     kept = np.flatnonzero(prior > 0.0)
@@ -85,9 +93,16 @@ def unexplained(
 ) -> Contradiction:
     """Test whether residuals are significantly larger than declared.
 
-    `what`: source of the residuals: "beacon A". `chi_square`: sum of the squared whitened
-    residuals. `freedom`: independent values, less fitted parameters. `limit`: share of the false
-    alarms of this test.
+    Parameters
+    ----------
+    what : str
+        Source of the residuals: "beacon A".
+    chi_square : float
+        Sum of the squared whitened residuals.
+    freedom : float
+        Independent values, less fitted parameters.
+    limit : float
+        Share of the false alarms of this test.
     """
     if freedom <= 0.0:
         return Contradiction((), 1.0)

@@ -32,12 +32,25 @@ def survey_jacobians(
 ) -> tuple[Array, Array]:
     """Return the whitened Jacobians of the estimated and of the survey parameters of a fix.
 
-    `calibration`: its ``phase`` and ``log_gain`` may have one row for each pose. `nuisances`:
-    estimated with the pose. `time` (m,), `world_from_body` (m, 3, 3), `position_world` (m, 3).
-    `sqrt_information` (m, channels, 3, 3): whitening (1/T); zero where a channel is missing.
-    Returns `by_found` (m, rows, 6 + nuisances): with respect to the pose and the nuisances;
-    `by_survey` (m, rows, parameters): with respect to each column of the survey prior's square
-    root: one sigma of each parameter, if these are independent.
+    Parameters
+    ----------
+    calibration : Calibration
+        Its ``phase`` and ``log_gain`` may have one row for each pose.
+    nuisances : tuple of Block
+        Estimated with the pose.
+    time : ndarray, shape (m,)
+    world_from_body : ndarray, shape (m, 3, 3)
+    position_world : ndarray, shape (m, 3)
+    sqrt_information : ndarray, shape (m, channels, 3, 3)
+        Whitening (1/T); zero where a channel is missing.
+
+    Returns
+    -------
+    by_found : ndarray, shape (m, rows, 6 + nuisances)
+        With respect to the pose and the nuisances.
+    by_survey : ndarray, shape (m, rows, parameters)
+        With respect to each column of the survey prior's square root: one sigma of each parameter,
+        if these are independent.
     """
     site, result = calibration.site, dimension(nuisances)
     clocks = choose_blocks(site, (CLOCK_OFFSET.group,), parameters=(CLOCK_OFFSET,))

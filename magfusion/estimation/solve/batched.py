@@ -74,12 +74,20 @@ def minimise(
 ) -> Solution:
     """Minimise the sum of squares of each problem.
 
-    `model`: takes the numbers of the requested problems, shape (k,), and their states, shape
-    (k, ...); returns the normal equations there. `start` (problems, ...): of any type, also
-    objects: only ``model`` and ``move`` use it. `move`: takes states (k, ...) and steps (k, n) and
-    returns the moved states; addition by default. `max_iterations`: maximum number. `relative`,
-    `absolute`: a step that decreases the cost by less than this share, or by less than this amount,
-    is the last.
+    Parameters
+    ----------
+    model : callable
+        Takes the numbers of the requested problems, shape (k,), and their states, shape (k, ...);
+        returns the normal equations there.
+    start : ndarray, shape (problems, ...)
+        Of any type, also objects: only ``model`` and ``move`` use it.
+    move : callable
+        Takes states (k, ...) and steps (k, n) and returns the moved states; addition by default.
+    max_iterations : int
+        Maximum number.
+    relative, absolute : float
+        A step that decreases the cost by less than this share, or by less than this amount, is
+        the last.
     """
     state = start.copy()
     rows = np.arange(len(state))

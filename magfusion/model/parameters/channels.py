@@ -108,11 +108,24 @@ def linearize_channels(
 ) -> tuple[Array, Array, Array]:
     """Predict every channel as real numbers, with the Jacobian by pose and calibration.
 
-    `blocks`: columns of the calibration's tangent vector. `time` (n,), `world_from_body` (n, 3, 3),
-    `position_world` (n, 3). `twist_body` (n, 6): needed where the time offset is among the blocks.
-    `detected` (n, channels): requested channels: a beacon without any is zero, if the epochs are
-    close to each other. Returns `value` (n, channels, 6): real parts, then imaginary parts (T);
-    `by_pose` (n, channels, 6, 6); `by_calibration` (n, channels, 6, dimension).
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Columns of the calibration's tangent vector.
+    time : ndarray, shape (n,)
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+    twist_body : ndarray, shape (n, 6), optional
+        Needed where the time offset is among the blocks.
+    detected : bool ndarray, shape (n, channels), optional
+        Requested channels: a beacon without any is zero, if the epochs are close to each other.
+
+    Returns
+    -------
+    value : ndarray, shape (n, channels, 6)
+        Real parts, then imaginary parts (T).
+    by_pose : ndarray, shape (n, channels, 6, 6)
+    by_calibration : ndarray, shape (n, channels, 6, dimension)
     """
     if detected is not None:
         return _linearize_detected(

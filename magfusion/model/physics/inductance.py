@@ -47,9 +47,17 @@ MUTUAL = {"circle": circle_mutual, "square": square_mutual}
 def coil_inductance(shape: str, sizes: Array, rows: int, pitch: float, wire: float) -> float:
     """Return the inductance of a coil of whole layers (H).
 
-    `shape`: "circle" or "square". `sizes` (layers,): radius, or half of the side, of each layer's
-    turns (m). `rows`: turns of a layer. `pitch`: from turn to turn along the axis (m). `wire`:
-    diameter of the conductor (m).
+    Parameters
+    ----------
+    shape : {"circle", "square"}
+    sizes : ndarray, shape (layers,)
+        Radius, or half of the side, of each layer's turns (m).
+    rows : int
+        Turns of a layer.
+    pitch : float
+        From turn to turn along the axis (m).
+    wire : float
+        Diameter of the conductor (m).
     """
     step = np.arange(float(rows))
     pairs = np.where(step == 0.0, rows, 2.0 * (rows - step))

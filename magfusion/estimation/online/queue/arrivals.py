@@ -46,13 +46,27 @@ MARGIN = 0.1  # s; of inertial samples about a window
 class Arrivals(ABC):
     """Streams of a platform, sorted by time, each on its own clock.
 
-    What depends on how many magnetometers there are is left to its two kinds. `imu`: of the motion
-    prior, where the platform has none. `streams`: raw samples of each magnetometer; empty where
-    fields are given. `fields`: one epoch each, the oldest first. `steady`: by the time of the epoch
-    (s), its static fields. `last_epoch`: time of the last fields (s). `short`: of tones that are
-    close, where one magnetometer measures them together. `open_signs`: amplitudes that are dropped
-    because their sign is undetermined. `without`: number of epochs without each magnetometer, while
-    it was silent.
+    What depends on how many magnetometers there are is left to its two kinds.
+
+    Attributes
+    ----------
+    imu : InertialStream
+        Of the motion prior, where the platform has none.
+    streams : list of SensorStream
+        Raw samples of each magnetometer; empty where fields are given.
+    fields : list of FieldSamples
+        One epoch each, the oldest first.
+    steady : dict
+        By the time of the epoch (s), its static fields.
+    others : OtherMeasurements
+    last_epoch : float
+        Time of the last fields (s).
+    short : ShortWindows, optional
+        Of tones that are close, where one magnetometer measures them together.
+    open_signs : int
+        Amplitudes that are dropped because their sign is undetermined.
+    without : Counter
+        Number of epochs without each magnetometer, while it was silent.
     """
 
     imu: InertialStream
@@ -294,9 +308,18 @@ class Arrivals(ABC):
     ) -> EpochMeasurements | None:
         """Return what was detected and measured at a prediction; None without a measurement.
 
-        `before`, `predicted`: at the previous epoch and at this one. `samples`: of this epoch; None
-        where it may have a window. `step`: since fields were last measured (s). `earth`: whether a
-        static field is a measurement. `standing`: whether the platform is known to be stationary.
+        Parameters
+        ----------
+        before, predicted : State
+            At the previous epoch and at this one.
+        samples : FieldSamples, optional
+            Of this epoch; None where it may have a window.
+        step : float
+            Since fields were last measured (s).
+        earth : bool
+            Whether a static field is a measurement.
+        standing : bool
+            Whether the platform is known to be stationary.
         """
         time = predicted.time
         self.without.update(self._silent())

@@ -58,10 +58,18 @@ def measurements_of_fields(
 ) -> EpochMeasurements:
     """Return the fields of one epoch as measurements at a prediction.
 
-    `step`: since fields were last measured (s). `repeats`: number of epochs that contain each
-    sample of overlapping windows. `by_time_offset`: derivative of the phasors by the IMU's time
-    offset, as of `field_phasors`. `earth`: whether a static field is a measurement. `standing`:
-    whether the platform is known to be stationary.
+    Parameters
+    ----------
+    step : float
+        Since fields were last measured (s).
+    repeats : float
+        Number of epochs that contain each sample of overlapping windows.
+    by_time_offset : complex ndarray, optional
+        Derivative of the phasors by the IMU's time offset, as of `field_phasors`.
+    earth : bool
+        Whether a static field is a measurement.
+    standing : bool
+        Whether the platform is known to be stationary.
     """
     now, offset = np.zeros(1, dtype=np.int64), np.full(1, imu.offset)
     rate_body = (imu.rate_body(predicted.time) - predicted.gyro_bias_body)[None]

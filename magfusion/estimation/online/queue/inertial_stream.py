@@ -17,9 +17,21 @@ OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 class InertialStream:
     """The inertial samples of a platform, each by its own stamp.
 
-    `offset`: added to the stamps for the log's clock (s). `buffer`: rates and specific forces of
-    the body. `filler`: substitutes for missing samples. `usual`: sampling interval (s), once there
-    is a state. `frozen`: samples that are dropped because a sensor is frozen.
+    Parameters
+    ----------
+    offset : float
+        Added to the stamps for the log's clock (s).
+
+    Attributes
+    ----------
+    buffer : Buffer
+        Rates and specific forces of the body.
+    filler : ImuGapFiller
+        Substitutes for missing samples.
+    usual : float, optional
+        Sampling interval (s), once there is a state.
+    frozen : int
+        Samples that are dropped because a sensor is frozen.
     """
 
     buffer: Buffer

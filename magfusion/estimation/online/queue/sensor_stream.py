@@ -22,11 +22,25 @@ BEGINNING = 0.5  # s; of samples, to start a receiver that had none at the first
 class SensorStream:
     """One magnetometer's samples on the log's clock, its receiver, and its pending windows.
 
-    `receiver`: of this magnetometer only, on the log's clock. It begins with the first state, and
-    never where phasors are given. `name`: of the samples, for error messages. `windows`: numbers of
-    windows that are admitted and not demodulated yet. `now`: of the window at the state that is to
-    be predicted. `late`: windows that arrived after the others were processed. `unseen`: windows
-    without inertial samples.
+    Parameters
+    ----------
+    receiver : Receiver
+        Of this magnetometer only, on the log's clock.  It begins with the first state, and never
+        where phasors are given.
+    name : str
+        Of the samples, for error messages.
+
+    Attributes
+    ----------
+    samples : Buffer
+    windows : deque of int
+        Numbers of windows that are admitted and not demodulated yet.
+    now : int, optional
+        Of the window at the state that is to be predicted.
+    late : int
+        Windows that arrived after the others were processed.
+    unseen : int
+        Windows without inertial samples.
     """
 
     receiver: Receiver
@@ -86,8 +100,16 @@ class SensorStream:
     ) -> FieldSamples | None:
         """Check the windows that are complete at a time (s); return the phasors of slots.
 
-        `imu`: all stored samples. `after`: windows up to this time are too late (s). `state`: the
-        newest. `offset`: added to the IMU's stamps (s).
+        Parameters
+        ----------
+        imu : ImuSamples
+            All stored samples.
+        after : float
+            Windows up to this time are too late (s).
+        state : State
+            The newest.
+        offset : float
+            Added to the IMU's stamps (s).
         """
         receiver = self.receiver
         if not receiver.complete(until):

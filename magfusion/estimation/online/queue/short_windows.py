@@ -81,9 +81,16 @@ class ShortWindows:
     ) -> EpochMeasurements:
         """Return the measurement of the current window at a prediction.
 
-        `before`, `predicted`: at the epoch before and at the centre. `waveform`, `imu`: covering
-        the window and, of the IMU, the interval before it. `offset`: IMU time offset with which the
-        states were propagated (s). `rate_body` (3,): without the gyro's bias (rad/s).
+        Parameters
+        ----------
+        before, predicted : State
+            At the epoch before and at the centre.
+        waveform, imu : Waveform, ImuSamples
+            Covering the window and, of the IMU, the interval before it.
+        offset : float
+            IMU time offset with which the states were propagated (s).
+        rate_body : ndarray, shape (3,)
+            Without the gyro's bias (rad/s).
         """
         receiver = self.receiver
         assert receiver.grid is not None
