@@ -16,7 +16,9 @@ MU0 = 4.0 * np.pi * MU0_OVER_4PI  # T m / A
 NANOTESLA, MICROTESLA = 1e-9, 1e-6  # T
 DEGREE = np.pi / 180.0  # rad
 NANOSECOND, HOUR, DAY = 1e-9, 3600.0, 86_400.0  # s
+NS_PER_S = 1_000_000_000
 STANDARD_GRAVITY = 9.80665  # m/s^2
+TINY = 1e-300  # added to, or least value of, a divisor that may be zero
 
 # Rate of states: at the field epochs, at every inertial sample, or a number per second (Hz).
 Rate = Literal["field", "imu"] | float

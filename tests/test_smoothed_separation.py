@@ -9,10 +9,12 @@ from small_problem import SIGMA, SmallLog
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph import considered, factors
-from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
+from magfusion.estimation.integrity import smoothed_separation
+from magfusion.estimation.integrity.smoothed_exclusion import separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.posterior import block_tridiagonal_system, marginals, native_rows
 from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import SLACK
 from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.model.trust import Risk, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -156,8 +158,8 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
     known = separate_smoothed(result), _marginals(result)
     for module in (factors, native_rows):
         monkeypatch.setattr(module, "PIECE", 7)
-    monkeypatch.setattr(block_tridiagonal_system, "AT_ONCE", 1.0)  # one beacon at once
-    monkeypatch.setattr(considered, "AT_ONCE", 1.0)  # and one parameter that is held
+    for module in (smoothed_separation, considered):  # one beacon or parameter at once
+        monkeypatch.setattr(module, "AT_ONCE", 1.0)
     estimate = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
     assert estimate[0] is not None

@@ -23,26 +23,13 @@ CHUNK = 1 << 16  # samples that a gap is filled with at a time
 
 @dataclass(frozen=True, eq=False)
 class AllanVariance:
-    """Allan variance by cluster time.
+    """Allan variance by cluster time."""
 
-    Parameters
-    ----------
-    tau : ndarray, shape (n,)
-        Length of a cluster (s).
-    variance : ndarray, shape (n, axes)
-        In the stream's unit, squared.
-    count : ndarray of int, shape (n,)
-        Differences of clusters, which overlap.
-    clusters : ndarray, shape (n,)
-        Number of non-overlapping clusters.
-    octave : bool ndarray, shape (n,)
-        Whether a cluster time is a power of two samples: those are nearly independent.
-    """
-
-    tau: Array
-    variance: Array
-    count: IntArray
-    clusters: Array
+    tau: Array  # (n,), length of a cluster (s)
+    variance: Array  # (n, axes), in the stream's unit, squared
+    count: IntArray  # (n,), differences of clusters, which overlap
+    clusters: Array  # (n,), number of non-overlapping clusters
+    # (n,), whether a cluster time is a power of two samples: those are nearly independent
     octave: Array
 
 
@@ -109,10 +96,7 @@ class _Level:
 class AllanStream:
     """Allan variance of samples that arrive in blocks.
 
-    Parameters
-    ----------
-    axes : int
-        Number of channels.
+    `axes`: number of channels.
     """
 
     def __init__(self, axes: int) -> None:
@@ -154,10 +138,7 @@ class AllanStream:
     def result(self, step: float) -> AllanVariance:
         """Return the Allan variance of the samples so far.
 
-        Parameters
-        ----------
-        step : float
-            Time from sample to sample (s).
+        `step`: time from sample to sample (s).
         """
         rows = [
             (m << k, level.square[m] / level.count[m], level.count[m], level.count[m] / m)

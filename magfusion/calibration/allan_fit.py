@@ -52,41 +52,23 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class AllanFit:
-    """Noise components of the Allan deviation of one axis.
+    """Noise components of the Allan deviation of one axis."""
 
-    Parameters
-    ----------
-    white : Fitted
-        ``n``, in the stream's unit times sqrt(s).
-    instability : Fitted
-        ``b``, in the stream's unit: the minimum Allan deviation is 0.664 of it where it is flat.
-    walk : Fitted
-        ``k``, in the stream's unit per sqrt(s).
-    steps : float
-        ``q``, in the stream's unit times s.
-    least, least_tau : float
-        The minimum Allan deviation of the fit within the cluster times, and where (s).
-    turns : bool
-        Whether it rises again after the minimum.
-    misfit : float
-        Reduced chi square.
-    worst_tau, worst : float
-        Where the fit deviates most (s), and by which factor of the deviation.
-    first_tau : float
-        Where the fit begins (s).
-    """
-
-    white: Fitted
+    white: Fitted  # ``n``, in the stream's unit times sqrt(s)
+    # ``b``, in the stream's unit: the minimum Allan deviation is 0.664 of it where it is flat
     instability: Fitted
-    walk: Fitted
-    steps: float
+    walk: Fitted  # ``k``, in the stream's unit per sqrt(s)
+    steps: float  # ``q``, in the stream's unit times s
+    # least, least_tau: the minimum Allan deviation of the fit within the cluster times, and where
+    # (s)
     least: float
     least_tau: float
-    turns: bool
-    misfit: float
+    turns: bool  # whether it rises again after the minimum
+    misfit: float  # reduced chi square
+    # worst_tau, worst: where the fit deviates most (s), and by which factor of the deviation
     worst_tau: float
     worst: float
-    first_tau: float
+    first_tau: float  # where the fit begins (s)
 
     def deviation(self, tau: Array) -> Array:
         """Return the Allan deviation of the fit at cluster times (s)."""

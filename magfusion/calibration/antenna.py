@@ -32,45 +32,23 @@ Observe = Callable[[Antenna, Array, Array], Coupling]  # as `observe_antenna`
 
 @dataclass(frozen=True, eq=False)
 class AntennaSurvey:
-    """Couplings at poses of the sensor in beacon axes; leading axes are surveys.
+    """Couplings at poses of the sensor in beacon axes; leading axes are surveys."""
 
-    Parameters
-    ----------
-    beacon_from_sensor : ndarray, shape (..., n, 3, 3)
-    position_beacon : ndarray, shape (..., n, 3)
-        (m)
-    coupling : ndarray, shape (..., n, 3, 3)
-        Rows are receiving coils, columns transmitting ones (T).
-    sigma : ndarray, shape (..., n)
-        Standard deviation of each coupling of a pose (T).
-    """
-
-    beacon_from_sensor: Array
-    position_beacon: Array
-    coupling: Array
-    sigma: Array
+    beacon_from_sensor: Array  # (..., n, 3, 3)
+    position_beacon: Array  # (..., n, 3) (m)
+    coupling: Array  # (..., n, 3, 3), rows are receiving coils, columns transmitting ones (T)
+    sigma: Array  # (..., n), standard deviation of each coupling of a pose (T)
 
 
 @dataclass(frozen=True, eq=False)
 class AntennaFit:
-    """A calibrated antenna.
-
-    Parameters
-    ----------
-    cov : ndarray, shape (..., k, k)
-        Of `Antenna.vector`.
-    chi2 : ndarray, shape (...)
-        Squared whitened residuals, those of the priors included.
-    dof : int
-        Couplings; every parameter has its prior, which cancels it.
-    beacon_from_sensor, position_beacon : ndarray
-        The poses, refined where they were uncertain.
-    """
+    """A calibrated antenna."""
 
     antenna: Antenna
-    cov: Array
-    chi2: Array
-    dof: int
+    cov: Array  # (..., k, k), of `Antenna.vector`
+    chi2: Array  # (...), squared whitened residuals, those of the priors included
+    dof: int  # couplings; every parameter has its prior, which cancels it
+    # beacon_from_sensor, position_beacon: the poses, refined where they were uncertain
     beacon_from_sensor: Array
     position_beacon: Array
 
@@ -120,21 +98,10 @@ def fit_at_known_poses(
 ) -> AntennaFit:
     """Fit the antenna by least squares, the poses taken as exact.
 
-    Many surveys are fitted in one call.
-
-    Parameters
-    ----------
-    start : Antenna
-        Mean of the prior; of a single antenna, or with the survey's leading axes.
-    sigma : ndarray, shape (k,) or (k, k)
-        Of the prior (`prior_sigma`), or a factor of its covariance (`prior_root`).
-    model : callable
-        Predicts the couplings; one that is not `observe_antenna` takes one survey alone.
-
-    Raises
-    ------
-    EstimationError
-        Where it does not converge.
+    Many surveys are fitted in one call. `start`: mean of the prior; of a single antenna, or with
+    the survey's leading axes. `sigma` (k,) or (k, k): of the prior (`prior_sigma`), or a factor of
+    its covariance (`prior_root`). `model`: predicts the couplings; one that is not
+    `observe_antenna` takes one survey alone. Raises EstimationError where it does not converge.
     """
     lead = survey.coupling.shape[:-3]
     root = prior_root(sigma)
@@ -182,12 +149,7 @@ def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
 
     Couplings determine only the product of moments and sensitivities.  The prior splits it, with a
     sigma that is no error of any coupling.  Here the receiver's mean gain is fixed, and the sigmas
-    are those of all other parameters (the S-transformation of geodesy).
-
-    Parameters
-    ----------
-    fit : AntennaFit
-        Of one antenna.
+    are those of all other parameters (the S-transformation of geodesy). `fit`: of one antenna.
     """
     result = fit.antenna
     size = np.linalg.norm(result.sensitivities_sensor, axis=-1)

@@ -34,24 +34,15 @@ _PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class AntennaObservability:
-    """Observability of the antennas from couplings at some poses.
-
-    Parameters
-    ----------
-    singular : ndarray
-        Relative to the largest, in descending order: parameters are relative to the coils' moments
-        and sensitivities and to the mean distance.
-    null_space : tuple of str
-        One line for each group of undetermined combinations, in words.
-    min_poses : int
-        Number of these poses, in their order, with which the rank is reached.
-    """
+    """Observability of the antennas from couplings at some poses."""
 
     parameters: int
     rank: int
+    # relative to the largest, in descending order: parameters are relative to the coils' moments
+    # and sensitivities and to the mean distance
     singular: Array
-    null_space: tuple[str, ...]
-    min_poses: int
+    null_space: tuple[str, ...]  # one line for each group of undetermined combinations, in words
+    min_poses: int  # number of these poses, in their order, with which the rank is reached
 
 
 def observability(

@@ -25,23 +25,13 @@ MOMENTS, CENTRES, SIZES = slice(0, 9), slice(9, 18), slice(18, None)  # of one a
 
 @dataclass(frozen=True, eq=False)
 class ProbeFit:
-    """An antenna calibrated with a probe.
+    """An antenna calibrated with a probe."""
 
-    Parameters
-    ----------
-    vector : ndarray, shape (k,)
-        Moments (9), centres (9), and sizes (three, or one of all) where they are modelled.
-    cov : ndarray, shape (k, k)
-    chi2 : float
-        Squared whitened residuals, those of the prior included.
-    dof : int
-        Readings; every parameter has its prior, which cancels it.
-    """
-
+    # (k,), moments (9), centres (9), and sizes (three, or one of all) where they are modelled
     vector: Array
-    cov: Array
-    chi2: float
-    dof: int
+    cov: Array  # (k, k)
+    chi2: float  # squared whitened residuals, those of the prior included
+    dof: int  # readings; every parameter has its prior, which cancels it
 
 
 Predict = Callable[[Array, ProbeReadings], Array]  # what a probe reads of an antenna's vector (T)
@@ -55,10 +45,7 @@ def read_of_term(vector: Array, readings: ProbeReadings) -> Array:
 def read_of_beacon(beacon: Beacon, put: Callable[[Beacon, Array], Beacon]) -> Predict:
     """Return a probe's readings of a site's beacon coils.
 
-    Parameters
-    ----------
-    put : callable
-        Returns the beacon with the coils of an antenna's vector.
+    `put`: returns the beacon with the coils of an antenna's vector.
     """
 
     def predicted(vector: Array, readings: ProbeReadings) -> Array:
@@ -95,10 +82,8 @@ def bench_sigma(
 ) -> Array:
     """Return the standard deviation of readings (n,) by noise and by the bench (T).
 
-    Parameters
-    ----------
-    position_sigma, tilt_sigma : float
-        Of each axis of the probe's place (m), and of its axis about each of two (rad).
+    `position_sigma`, `tilt_sigma`: of each axis of the probe's place (m), and of its axis about
+    each of two (rad).
     """
     _, _, by_place, by_axis = _term(vector, readings)
     across = by_axis - np.sum(by_axis * readings.axis, axis=1)[:, None] * readings.axis
@@ -111,17 +96,8 @@ def fit_by_probe(
 ) -> ProbeFit:
     """Fit an antenna to readings whose sigmas are those of `bench_sigma`.
 
-    Parameters
-    ----------
-    start : ndarray, shape (k,)
-        Mean of the prior.
-    sigma : ndarray, shape (k,)
-        Of the prior.
-
-    Raises
-    ------
-    EstimationError
-        Where it does not converge.
+    `start` (k,): mean of the prior. `sigma` (k,): of the prior. Raises EstimationError where it
+    does not converge.
     """
 
     def normal(_: IntArray, scaled: Array) -> NormalEquations:
@@ -158,10 +134,7 @@ def in_units_of_sensitivity(readings: ProbeReadings, vector: Array) -> ProbeRead
 
 
 def left_out_errors(
-    readings: ProbeReadings,
-    start: Array,
-    sigma: Array,
-    predict: Predict = read_of_term,
+    readings: ProbeReadings, start: Array, sigma: Array, predict: Predict = read_of_term
 ) -> tuple[Array, Array]:
     """Return leave-one-point-out errors relative to the field there, of the start and of fits.
 

@@ -27,23 +27,12 @@ SMALLEST_KAPPA = 1e-9  # m^2; of coils of a tenth of a millimetre, which are poi
 
 @dataclass(frozen=True, eq=False)
 class BodySurvey:
-    """Couplings at known poses of the body.
+    """Couplings at known poses of the body."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    coupling : ndarray, shape (n, 3, 3)
-        Rows are receiving coils, columns transmitting ones (T).
-    sigma : ndarray, shape (n,)
-        Of each coupling of a pose (T).
-    """
-
-    world_from_body: Array
-    position_world: Array
-    coupling: Array
-    sigma: Array
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    coupling: Array  # (n, 3, 3), rows are receiving coils, columns transmitting ones (T)
+    sigma: Array  # (n,), of each coupling of a pose (T)
 
     def rows(self, chosen: Array) -> "BodySurvey":
         """Return a subset of the poses."""
@@ -139,12 +128,8 @@ def into_mounting(
 ) -> tuple[AntennaFit, Magnetometer]:
     """Return a fit whose receiver is rotated and shifted as little as possible, and the mounting.
 
-    Parameters
-    ----------
-    sensor : Magnetometer
-        Mounted as in the fit.
-    declared : ndarray, shape (3, 3)
-        Matrix from which the fitted matrix is to differ least.
+    `sensor`: mounted as in the fit. `declared` (3, 3): matrix from which the fitted matrix is to
+    differ least.
     """
     rows = fit.antenna.sensitivities_sensor
     turn, shift = _nearest_turn(rows, declared), np.mean(fit.antenna.centres_sensor, axis=0)

@@ -27,22 +27,13 @@ DEVIATES = 3.0  # sigmas
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of fixes, one column for the attitude (rad) and one for the position (m).
+    """Errors of fixes, one column for the attitude (rad) and one for the position (m)."""
 
-    Parameters
-    ----------
-    difference : ndarray, shape (n, 2)
-        From the surveyed poses.
-    rms, rms_sigma : ndarray, shape (2,)
-        Of the fixes themselves, and its standard deviation.
-    survey : ndarray, shape (2,)
-        Declared error of the survey's poses.
-    """
-
-    difference: Array
+    difference: Array  # (n, 2), from the surveyed poses
+    # rms, rms_sigma: (2,), of the fixes themselves, and its standard deviation
     rms: Array
     rms_sigma: Array
-    survey: Array
+    survey: Array  # (2,), declared error of the survey's poses
 
 
 def fixed_poses(site: Site, beacon: Beacon, survey: BodySurvey) -> tuple[Array, Array]:
@@ -78,29 +69,17 @@ def differences(site: Site, beacon: Beacon, survey: BodySurvey) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Errors of fixes predicted from noise and calibration, per pose.
+    """Errors of fixes predicted from noise and calibration, per pose."""
 
-    Parameters
-    ----------
-    square : ndarray, shape (n, 2)
-        Mean square error (rad^2, m^2).
-    Square of the residuals that no pose explains, relative to its expected value.
-        Square of the residuals that no pose takes up, by what is expected of it.
-    """
-
-    square: Array
+    square: Array  # (n, 2), mean square error (rad^2, m^2)
+    # square of the residuals that no pose takes up, by what is expected of it
     excess: Array
 
 
 def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) -> Expected:
     """Return the predicted errors of fixes at poses that the antennas were not fitted to.
 
-    Parameters
-    ----------
-    site, beacon
-        With the antennas of the fit.
-    survey : BodySurvey
-        Its poses are the evaluation points.
+    `site`, `beacon`: with the antennas of the fit. `survey`: its poses are the evaluation points.
     """
     sensor = site.platform.magnetometer
     own = survey.of_sensor(beacon, sensor)
@@ -142,14 +121,8 @@ def turned_elsewhere(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySu
 def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> PoseErrors:
     """Return the errors of the fixes alone.
 
-    Parameters
-    ----------
-    difference : ndarray, shape (n, 2)
-        From surveyed poses (rad, m).
-    survey : ndarray, shape (2,)
-        Error of these, one sigma an axis.
-    predicted : Expected, optional
-        Predicted errors of the fixes.
+    `difference` (n, 2): from surveyed poses (rad, m). `survey` (2,): error of these, one sigma an
+    axis. `predicted`: predicted errors of the fixes.
     """
     n, of_survey = len(difference), 3.0 * survey**2
     square = difference**2 - of_survey

@@ -28,26 +28,14 @@ LARGEST_CONDITION = 1e7  # of the scaled Jacobian
 
 @dataclass(frozen=True, eq=False)
 class BeaconMeasurements:
-    """Measurements of one beacon by magnetometers at known poses.
+    """Measurements of one beacon by magnetometers at known poses."""
 
-    Parameters
-    ----------
-    beacon : Beacon
-        As declared.
-    world_from_body : ndarray, shape (points, 3, 3)
-    position_world : ndarray, shape (points, 3)
-        Origin of the body (m).
-    (T), measured axes; NaN where missing.
-        (T), measured axes; NaN where one is missing.
-    sigma : ndarray, shape (points, tones, 2)
-        Of each component of the real and of the imaginary part, in all runs (T).
-    """
-
-    beacon: Beacon
+    beacon: Beacon  # as declared
     magnetometer: Magnetometer
-    world_from_body: Array
-    position_world: Array
-    phasor_sensor: ComplexArray
+    world_from_body: Array  # (points, 3, 3)
+    position_world: Array  # (points, 3), origin of the body (m)
+    phasor_sensor: ComplexArray  # (T), measured axes; NaN where one is missing
+    # (points, tones, 2), of each component of the real and of the imaginary part, in all runs (T)
     sigma: Array
 
     @property
@@ -81,46 +69,26 @@ class BeaconMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class BeaconFits:
-    """The best fit of each run, and other local minima.
+    """The best fit of each run, and other local minima."""
 
-    Parameters
-    ----------
-    centre_world : ndarray, shape (runs, 3)
-        Of the beacon's origin (m).
-    moments_world : complex ndarray, shape (runs, tones, 3)
-        Of each tone, drive phase included (A m^2).
-    chi_square : ndarray, shape (runs,)
-    cov : ndarray, shape (runs, unknowns, unknowns)
-        Of the centre, then of each tone's moment: its real part, then its imaginary part unless
-        that is known (`BeaconMeasurements.real_tones`).
-    rivals_world : ndarray, shape (runs, rivals, 3)
-        Centres of other minima (m), best first; NaN where there are no more.
-    rival_chi_square : ndarray, shape (runs, rivals)
-    """
-
-    centre_world: Array
-    moments_world: ComplexArray
-    chi_square: Array
+    centre_world: Array  # (runs, 3), of the beacon's origin (m)
+    moments_world: ComplexArray  # (runs, tones, 3), of each tone, drive phase included (A m^2)
+    chi_square: Array  # (runs,)
+    # (runs, unknowns, unknowns), of the centre, then of each tone's moment: its real part, then its
+    # imaginary part unless that is known (`BeaconMeasurements.real_tones`)
     cov: Array
+    # (runs, rivals, 3), centres of other minima (m), best first; NaN where there are no more
     rivals_world: Array
-    rival_chi_square: Array
+    rival_chi_square: Array  # (runs, rivals)
 
 
 def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> BeaconFits:
     """Find centre and moments of a beacon by variable projection, seeded on a grid.
 
     Its coils are points: the field of a coil of finite size is linear in its current, but not in
-    its axis; `magfusion.calibration.beacon_refined.calibrate_one` models the size.
-
-    Parameters
-    ----------
-    reach : float
-        Maximum distance of the beacon from its declared position (m).
-
-    Raises
-    ------
-    InputError
-        Where there are fewer than two magnetometers, or they do not determine the unknowns.
+    its axis; `magfusion.calibration.beacon_refined.calibrate_one` models the size. `reach`: maximum
+    distance of the beacon from its declared position (m). Raises InputError where there are fewer
+    than two magnetometers, or they do not determine the unknowns.
     """
     _refuse_too_few(measured)
     seen = whitened_parts(measured, np.nan_to_num(measured.phasor_sensor)[..., None])[..., 0]
@@ -180,14 +148,7 @@ def whitened_parts(measured: BeaconMeasurements, columns: ComplexArray) -> Array
 def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]:
     """Return the whitened phasors of unit moments, world axes, and their derivative by the centre.
 
-    Parameters
-    ----------
-    centre : ndarray, shape (k, 3)
-
-    Returns
-    -------
-    value : ndarray, shape (k, numbers, moments)
-    by_centre : ndarray, shape (k, numbers, moments, 3)
+    `centre` (k, 3). Returns `value` (k, numbers, moments); `by_centre` (k, numbers, moments, 3).
     """
     beacon, rotated = measured.beacon, measured.world_from_body
     offset = measured.position_world - centre[:, None]
@@ -259,10 +220,7 @@ def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Arr
 def _inverse(jacobian: Array, reach: float) -> Array:
     """Return the covariance of all unknowns of each run.
 
-    Raises
-    ------
-    InputError
-        Where a combination of unknowns, or the position itself, is not determined.
+    Raises InputError where a combination of unknowns, or the position itself, is not determined.
     """
     scale = np.linalg.norm(jacobian, axis=-2)
     safe = np.where(scale > 0.0, scale, 1.0)

@@ -18,43 +18,26 @@ OPEN = 0.1  # of the moment that a turn moves, below which it goes with the driv
 
 @dataclass(frozen=True, eq=False)
 class RefinedBeacon:
-    """A beacon after calibration.
+    """A beacon after calibration."""
 
-    Parameters
-    ----------
-    beacon : Beacon
-        With the posterior sigmas; it predicts the fitted phasors, except for the drive phase of an
-        unsynchronised beacon.
-    phase : ndarray, shape (tones,)
-        Estimated drive phase, in addition to the coils' own (rad); zero where it is known.
-    open_beacon : ndarray, shape (n, 3)
-        Axes, declared beacon axes, about which rotation is unobservable: there the declared
-        attitude and its sigma are kept.
-    """
-
+    # with the posterior sigmas; it predicts the fitted phasors, except for the drive phase of an
+    # unsynchronised beacon
     beacon: Beacon
+    # (tones,), estimated drive phase, in addition to the coils' own (rad); zero where it is known
     phase: Array
+    # (n, 3), axes, declared beacon axes, about which rotation is unobservable: there the declared
+    # attitude and its sigma are kept
     open_beacon: Array
 
 
 def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array]:
     """Return the attitude in which the declared moments best match the estimated ones.
 
-    The polar decomposition of paper 002's problem: imbalance and angle between the coils are
-    split evenly.  Of equally good rotations, the one nearest to the declared is returned.
-
-    Parameters
-    ----------
-    beacon : Beacon
-        As declared.
-    moments_world : complex ndarray, shape (runs, tones, 3)
-        (A m^2)
-
-    Returns
-    -------
-    world_from_beacon : ndarray, shape (runs, 3, 3)
-    phase : ndarray, shape (runs, tones)
-        Of the drive, in addition to the declared (rad); zero for a synchronised beacon.
+    The polar decomposition of paper 002's problem: imbalance and angle between the coils are split
+    evenly.  Of equally good rotations, the one nearest to the declared is returned. `beacon`: as
+    declared. `moments_world` (runs, tones, 3) (A m^2). Returns `world_from_beacon` (runs, 3, 3);
+    `phase` (runs, tones): of the drive, in addition to the declared (rad); zero for a synchronised
+    beacon.
     """
     declared = _drive(beacon)
     unit = declared / np.linalg.norm(declared, axis=-1, keepdims=True) ** 2
@@ -112,12 +95,7 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
 
     The coils' offsets rotate with the attitude to be estimated, and so does the contribution of
     their size to the field, which is subtracted from the measurements.  The fit is iterated until
-    both converge.
-
-    Parameters
-    ----------
-    reach : float
-        As in `magfusion.calibration.beacon.calibrate_beacon` (m).
+    both converge. `reach`: as in `magfusion.calibration.beacon.calibrate_beacon` (m).
     """
     declared, seen, sized = measured.beacon, measured.phasor_sensor, is_sized(measured.beacon)
     for _ in range(TURNS if sized or declared.centres_beacon.any() else 1):

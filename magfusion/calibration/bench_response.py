@@ -23,20 +23,11 @@ GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BenchSnapshots(Snapshots):
-    """Phasors at poses that are known up to an error of each.
+    """Phasors at poses that are known up to an error of each."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    pose_sigma : ndarray, shape (6,)
-        Of rotation, then position, body axes (rad, m).
-    """
-
-    world_from_body: Array
-    position_world: Array
-    pose_sigma: Array
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    pose_sigma: Array  # (6,), of rotation, then position, body axes (rad, m)
 
     def with_phases(self) -> BenchSnapshots:
         """Return the same with the drive phases that fit best as declared."""

@@ -33,22 +33,10 @@ _SYMMETRIC = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
     """Fit an ellipsoid to readings, by least squares of the field's magnitude.
 
-    Parameters
-    ----------
-    measured : ndarray, shape (..., n, 3)
-        (T), n at least 9.
-    field_size : float
-        Of the field (T), the same in all readings.
-
-    Returns
-    -------
-    MagnetometerFit
-        The symmetric matrix of this shape; the covariance assumes a known rotation.
-
-    Raises
-    ------
-    EstimationError
-        Where the readings lie on no ellipsoid: too few of them, or all on one side.
+    `measured` (..., n, 3) (T), n at least 9. `field_size`: of the field (T), the same in all
+    readings. Returns the symmetric matrix of this shape; the covariance assumes a known rotation.
+    Raises EstimationError where the readings lie on no ellipsoid: too few of them, or all on one
+    side.
     """
     scaled = measured / field_size
     if scaled.shape[-2] < MIN_READINGS:
@@ -83,26 +71,11 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
 def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) -> MagnetometerFit:
     """Fit all twelve parameters to the field's magnitude and to its angle with the vertical.
 
-    Parameters
-    ----------
-    measured : ndarray, shape (..., n, 3)
-        (T)
-    up_sensor : ndarray, shape (..., n, 3)
-        The vertical, measured by the accelerometer at rest, of any length.
-    field_size : float
-        (T)
-
-    Returns
-    -------
-    MagnetometerFit
-        The dip is also estimated, at no loss of accuracy for varied orientations.  Both residuals
-        of a reading stem from the same noise and are correlated; the fit ignores the correlation
-        (the graph does not), the covariance includes it.
-
-    Raises
-    ------
-    EstimationError
-        As `fit_ellipsoid`.
+    `measured` (..., n, 3) (T). `up_sensor` (..., n, 3): the vertical, measured by the accelerometer
+    at rest, of any length. `field_size` (T). The dip is also estimated, at no loss of accuracy for
+    varied orientations. Both residuals of a reading stem from the same noise and are correlated;
+    the fit ignores the correlation (the graph does not), the covariance includes it. Raises
+    EstimationError as `fit_ellipsoid`.
     """
     scaled = measured / field_size
     up = up_sensor / np.linalg.norm(up_sensor, axis=-1, keepdims=True)
@@ -134,10 +107,8 @@ def _solved(
 ) -> tuple[Array, Array, Array]:
     """Return the least-squares state (..., k) with its residuals and their Jacobian.
 
-    Raises
-    ------
-    EstimationError
-        Where the readings do not determine the state, or the search does not converge.
+    Raises EstimationError where the readings do not determine the state, or the search does not
+    converge.
     """
     each = [part.reshape(-1, *part.shape[-2:]) for part in readings]
 

@@ -32,26 +32,15 @@ _LIMITS = ((0.1, 30.0), (1e-4, 2.0), (1e-4, 0.6), (1e-4, 0.3))
 
 @dataclass(frozen=True, eq=False)
 class MapPoints:
-    """Measurements of every beacon at known poses.
+    """Measurements of every beacon at known poses."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        Of the body (m).
-    phasor_sensor : complex ndarray, shape (n, channels, 3)
-        Measured axes (T), channels in the site's order; NaN where missing.
-    sigma : ndarray, shape (n, channels)
-        Of each component (T).
-    phase : ndarray, shape (n, channels), optional
-        Drive phase in addition to the coils' own (rad).  If None, the phase of unsynchronised
-        beacons is estimated at each point.
-    """
-
-    world_from_body: Array
-    position_world: Array
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3), of the body (m)
+    # (n, channels, 3), measured axes (T), channels in the site's order; NaN where missing
     phasor_sensor: ComplexArray
-    sigma: Array
+    sigma: Array  # (n, channels), of each component (T)
+    # (n, channels), drive phase in addition to the coils' own (rad). If None, the phase of
+    # unsynchronised beacons is estimated at each point
     phase: Array | None = None
 
     def __len__(self) -> int:
@@ -71,21 +60,14 @@ class MapPoints:
 
 @dataclass(frozen=True, eq=False)
 class MapFit:
-    """A site with its map, and the map's accuracy.
-
-    Parameters
-    ----------
-    error_without, error_with : dict of str to float
-        Relative error of each beacon's modelled field at points not used for the map, root mean
-        square over the points.
-    points : dict of str to int
-        Number of points used for the map of each beacon.
-    """
+    """A site with its map, and the map's accuracy."""
 
     site: Site
+    # error_without, error_with: relative error of each beacon's modelled field at points not used
+    # for the map, root mean square over the points
     error_without: dict[str, float]
     error_with: dict[str, float]
-    points: dict[str, int]
+    points: dict[str, int]  # number of points used for the map of each beacon
 
 
 class _DetectedFields(NamedTuple):
@@ -111,15 +93,8 @@ class _Process(NamedTuple):
 def learn_field_map(site: Site, points: MapPoints) -> MapFit:
     """Estimate the map of every beacon; all beacons share the process.
 
-    Parameters
-    ----------
-    site : Site
-        Existing maps are replaced.
-
-    Raises
-    ------
-    EstimationError
-        Where a beacon was detected at too few points.
+    `site`: existing maps are replaced. Raises EstimationError where a beacon was detected at too
+    few points.
     """
     detected = _all_detected(site, points)
     for beacon, result in zip(site.beacons, detected, strict=True):
@@ -318,12 +293,7 @@ def _rms(value: Array) -> float:
 def thinned(points: MapPoints, site: Site, spacing: float) -> MapPoints:
     """Return one point per cube of a grid: the one with the least noise.
 
-    Parameters
-    ----------
-    points : MapPoints
-        E.g. the epochs of a smoothed log.
-    spacing : float
-        Edge of the cubes (m).
+    `points`: e.g. the epochs of a smoothed log. `spacing`: edge of the cubes (m).
     """
     sensor = site.platform.magnetometer
     sensor_world = points.position_world + points.world_from_body @ sensor.position_body

@@ -21,17 +21,11 @@ CALIBRATION_KEY = gtsam.symbol("c", 0)
 
 @dataclass(frozen=True, eq=False)
 class CalibrationEstimate:
-    """The estimate that the optimiser updates.
+    """The estimate that the optimiser updates."""
 
-    Parameters
-    ----------
-    values : gtsam.Values
-        Pose or attitude X(i) of each reading, and the other variables of the native factors.
-    calibration : ndarray, shape (k,)
-    """
-
+    # pose or attitude X(i) of each reading, and the other variables of the native factors
     values: gtsam.Values
-    calibration: Array
+    calibration: Array  # (k,)
 
 
 Rows = Callable[[CalibrationEstimate], tuple[Array, Array, Array]]
@@ -39,25 +33,16 @@ Rows = Callable[[CalibrationEstimate], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class CalibrationGraph:
-    """A `magfusion.estimation.solve.bordered.BorderedProblem`.
+    """A `magfusion.estimation.solve.bordered.BorderedProblem`."""
 
-    Parameters
-    ----------
-    rows : callable
-        Returns whitened residuals (n, m) with derivatives by pose (n, m, d) and by calibration
-        (n, m, k).
-    native : gtsam.NonlinearFactorGraph
-        Prior factors of the poses, linearised by GTSAM.
-    declared, cov : ndarray, shape (k,) and (k, k)
-        Prior of the calibration.
-    steps : dict of int to ndarray
-        Each key of the values, in the order of elimination, with the step scale of unit damping.
-    """
-
+    # returns whitened residuals (n, m) with derivatives by pose (n, m, d) and by calibration
+    # (n, m, k)
     rows: Rows
-    native: gtsam.NonlinearFactorGraph
+    native: gtsam.NonlinearFactorGraph  # prior factors of the poses, linearised by GTSAM
+    # declared, cov: (k,) and (k, k), prior of the calibration
     declared: Array
     cov: Array
+    # each key of the values, in the order of elimination, with the step scale of unit damping
     steps: dict[int, Array]
 
     @property
@@ -109,17 +94,9 @@ def solve(
 ) -> tuple[Optimised[CalibrationEstimate], Array]:
     """Return the best estimate, and the covariance of its calibration, shape (k, k).
 
-    Parameters
-    ----------
-    name : str
-        Of the calibrated device, for the messages.
-    iterations, tolerance
-        As in `magfusion.estimation.solve.bordered.optimise`.
-
-    Raises
-    ------
-    EstimationError
-        Where the loop does not converge, or the graph leaves a variable undetermined.
+    `name`: of the calibrated device, for the messages. `iterations`, `tolerance`: as in
+    `magfusion.estimation.solve.bordered.optimise`. Raises EstimationError where the loop does not
+    converge, or the graph leaves a variable undetermined.
     """
     result = optimise(graph, start, iterations=iterations, tolerance=tolerance)
     if not result.converged:

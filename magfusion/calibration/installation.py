@@ -38,34 +38,21 @@ CONTRADICTED = 4.0  # sigmas of a single quantity, from which it is named
 
 @dataclass(frozen=True, eq=False)
 class BeaconCheck:
-    """What the measurements prove of one beacon.
-
-    Parameters
-    ----------
-    name : str
-    marks : int
-        Number of marks at which it is detected.
-    step_world, step_sigma : ndarray, shape (3,)
-        Its position less the declared one (m).
-    angle, angle_sigma : float
-        Rotation from its declared attitude (rad), and the largest sigma.
-    factor, factor_sigma : float
-        Its moment over the declared one, negative if its coils are reversed.
-    contradicted : bool
-        Whether its declaration does not explain the measurements.
-    faults : tuple of str
-        Of ``reversed``, ``moment``, ``position`` and ``axis``, largest first, if contradicted.
-    """
+    """What the measurements prove of one beacon."""
 
     name: str
-    marks: int
+    marks: int  # number of marks at which it is detected
+    # step_world, step_sigma: (3,), its position less the declared one (m)
     step_world: Array
     step_sigma: Array
+    # angle, angle_sigma: rotation from its declared attitude (rad), and the largest sigma
     angle: float
     angle_sigma: float
+    # factor, factor_sigma: its moment over the declared one, negative if its coils are reversed
     factor: float
     factor_sigma: float
-    contradicted: bool = False
+    contradicted: bool = False  # whether its declaration does not explain the measurements
+    # of ``reversed``, ``moment``, ``position`` and ``axis``, largest first, if contradicted
     faults: tuple[str, ...] = ()
 
     @property
@@ -76,22 +63,13 @@ class BeaconCheck:
 
 @dataclass(frozen=True, eq=False)
 class InstallationCheck:
-    """Result of a check of all beacons.
+    """Result of a check of all beacons."""
 
-    Parameters
-    ----------
-    beacons : tuple of BeaconCheck
-        In the order of the site.
-    chi_square, freedom : float
-        With all wrong beacons as found.
-    site : Site
-        With these beacons as found.
-    """
-
-    beacons: tuple[BeaconCheck, ...]
+    beacons: tuple[BeaconCheck, ...]  # in the order of the site
+    # chi_square, freedom: with all wrong beacons as found
     chi_square: float
     freedom: float
-    site: Site
+    site: Site  # with these beacons as found
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +115,7 @@ def check_installation(marked: MarkedSnapshots) -> InstallationCheck:
         poses = worst.estimate.turn, worst.estimate.place
     every = named | {name: _check_of(declared, fit) for name, fit in fits.items()}
     return InstallationCheck(
-        tuple(every[beacon.name] for beacon in declared.site.beacons),
-        before,
-        freedom,
-        marked.site,
+        tuple(every[beacon.name] for beacon in declared.site.beacons), before, freedom, marked.site
     )
 
 

@@ -26,31 +26,18 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerFit:
-    """Matrix and offset of a magnetometer, or of many at once.
+    """Matrix and offset of a magnetometer, or of many at once."""
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (..., 3, 3)
-    offset : ndarray, shape (..., 3)
-        (T)
-    cov : ndarray, shape (..., 12, 12)
-        Of the matrix, row by row, then of the offset (1, T).
-    """
-
-    matrix: Array
-    offset: Array
-    cov: Array
+    matrix: Array  # (..., 3, 3)
+    offset: Array  # (..., 3) (T)
+    cov: Array  # (..., 12, 12), of the matrix, row by row, then of the offset (1, T)
 
 
 def from_paper(bias: Array, scale: Array, misalignment: Array) -> tuple[Array, Array]:
     """Return matrix and offset from the b, K and E of paper 001.
 
-    Parameters
-    ----------
-    bias, scale : ndarray, shape (..., 3)
-        (T, 1)
-    misalignment : ndarray, shape (..., 3, 3)
-        Zero on the diagonal; the entry of row a and column b is the paper's ``e_ba``.
+    `bias`, `scale` (..., 3) (T, 1). `misalignment` (..., 3, 3): zero on the diagonal; the entry of
+    row a and column b is the paper's ``e_ba``.
     """
     return scale[..., None] * (np.eye(3) + misalignment), bias
 
@@ -64,17 +51,8 @@ def to_paper(matrix: Array, offset: Array) -> tuple[Array, Array, Array]:
 def field_from_measured(measured: Array, matrix: Array, offset: Array) -> Array:
     """Return the field from calibrated readings.
 
-    Parameters
-    ----------
-    measured : ndarray, shape (..., n, 3)
-        (T)
-    matrix : ndarray, shape (..., 3, 3)
-    offset : ndarray, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3)
-        (T), sensor axes.
+    `measured` (..., n, 3) (T), `matrix` (..., 3, 3), `offset` (..., 3). Returns (..., n, 3) (T),
+    sensor axes.
     """
     inverse = np.linalg.inv(matrix)
     return (measured - offset[..., None, :]) @ np.swapaxes(inverse, -1, -2)
@@ -89,16 +67,8 @@ def spread(field: Array) -> float:
 def missing_orientations(up_sensor: Array) -> list[str]:
     """Describe which orientations a calibration lacks.
 
-    Parameters
-    ----------
-    up_sensor : ndarray, shape (n, 3)
-        The vertical in sensor axes, of any length.
-
-    Returns
-    -------
-    list of str
-        E.g. ``the sensor's y axis never pointed up``; empty where each axis pointed, within 45 deg,
-        both up and down.
+    `up_sensor` (n, 3): the vertical in sensor axes, of any length. For example ``the sensor's y
+    axis never pointed up``; empty where each axis pointed, within 45 deg, both up and down.
     """
     unit = up_sensor / np.linalg.norm(up_sensor, axis=1, keepdims=True)
     missing = []

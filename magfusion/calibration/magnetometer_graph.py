@@ -28,33 +28,16 @@ ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerEpochs:
-    """Readings of the instruments at each attitude, and the priors of the attitudes.
+    """Readings of the instruments at each attitude, and the priors of the attitudes."""
 
-    Parameters
-    ----------
-    measured_sensor : ndarray, shape (n, 3)
-        (T)
-    field_sigma : float
-        Of each component (T).
-    accel_body : ndarray, shape (n, 3), optional
-        Specific force (m/s^2).
-    accel_sigma : ndarray, shape (n,), optional
-        Of each component, motion included (m/s^2).
-    turns : tuple, optional
-        One for each interval: the gyro's preintegrated rotation, or None without gyro data.
-    world_from_body : ndarray, shape (n, 3, 3), optional
-        As a turntable was set.
-    table_sigma : float, optional
-        Of each axis of that setting (rad).
-    """
-
-    measured_sensor: Array
-    field_sigma: float
-    accel_body: Array | None = None
-    accel_sigma: Array | None = None
+    measured_sensor: Array  # (n, 3) (T)
+    field_sigma: float  # of each component (T)
+    accel_body: Array | None = None  # (n, 3), specific force (m/s^2)
+    accel_sigma: Array | None = None  # (n,), of each component, motion included (m/s^2)
+    # one for each interval: the gyro's preintegrated rotation, or None without gyro data
     turns: tuple[gtsam.PreintegratedAhrsMeasurements | None, ...] = ()
-    world_from_body: Array | None = None
-    table_sigma: float | None = None
+    world_from_body: Array | None = None  # (n, 3, 3), as a turntable was set
+    table_sigma: float | None = None  # of each axis of that setting (rad)
 
     def __len__(self) -> int:
         return len(self.measured_sensor)
@@ -62,68 +45,36 @@ class MagnetometerEpochs:
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerPrior:
-    """Priors of the calibration; a sigma of zero fixes a value.
+    """Priors of the calibration; a sigma of zero fixes a value."""
 
-    Parameters
-    ----------
-    body_from_sensor : ndarray, shape (3, 3)
-        Mounting; always fixed.
-    matrix, offset : ndarray, shape (3, 3) and (3,)
-    cov : ndarray, shape (12, 12)
-        Of the matrix, row by row, and the offset (1, T).
-    field_world : ndarray, shape (3,)
-        Earth field (T); where its magnitude is fixed it sets the scale of the matrix.
-    dip_sigma : float
-        Of the angle between field and vertical (rad).
-    size_sigma : float
-        Of the natural logarithm of the field's magnitude.
-    gravity : float
-        (m/s^2)
-    accel_bias_sigma, gyro_bias_sigma : float
-        (m/s^2, rad/s)
-    """
-
-    body_from_sensor: Array
-    matrix: Array
-    offset: Array
-    cov: Array
+    body_from_sensor: Array  # (3, 3), mounting; always fixed
+    matrix: Array  # (3, 3)
+    offset: Array  # (3,)
+    cov: Array  # (12, 12), of the matrix, row by row, and the offset (1, T)
+    # (3,), Earth field (T); where its magnitude is fixed it sets the scale of the matrix
     field_world: Array
-    dip_sigma: float = 0.0
-    gravity: float = 9.80665
-    accel_bias_sigma: float = 0.0
-    gyro_bias_sigma: float = 0.0
-    size_sigma: float = 0.0
+    dip_sigma: float = 0.0  # of the angle between field and vertical (rad)
+    gravity: float = 9.80665  # (m/s^2)
+    accel_bias_sigma: float = 0.0  # (m/s^2)
+    gyro_bias_sigma: float = 0.0  # (rad/s)
+    size_sigma: float = 0.0  # of the natural logarithm of the field's magnitude
 
 
 @dataclass(frozen=True, eq=False)
 class GraphFit:
-    """A calibrated magnetometer with the other estimates.
-
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-        Where only the field gives the heading, the world frame is rotated by the declination.
-    dip_change : float
-        Of the field's angle below the horizon (rad).
-    accel_bias_body, gyro_bias_body : ndarray, shape (3,)
-        (m/s^2, rad/s)
-    field_residual : ndarray, shape (n, 3)
-        Predicted less measured, over sigma.
-    chi_square : float
-        Of all factors.
-    size_ratio : float
-        Estimated magnitude of the field over that of the prior.
-    """
+    """A calibrated magnetometer with the other estimates."""
 
     fit: MagnetometerFit
+    # (n, 3, 3), where only the field gives the heading, the world frame is rotated by the
+    # declination
     world_from_body: Array
-    dip_change: float
-    accel_bias_body: Array
-    gyro_bias_body: Array
-    field_residual: Array
-    chi_square: float
+    dip_change: float  # of the field's angle below the horizon (rad)
+    accel_bias_body: Array  # (3,) (m/s^2)
+    gyro_bias_body: Array  # (3,) (rad/s)
+    field_residual: Array  # (n, 3), predicted less measured, over sigma
+    chi_square: float  # of all factors
     iterations: int
-    size_ratio: float = 1.0
+    size_ratio: float = 1.0  # estimated magnitude of the field over that of the prior
 
 
 class Readings:
@@ -209,15 +160,8 @@ def fit_graph(
 ) -> GraphFit:
     """Estimate matrix, offset, attitudes and inertial biases from all readings.
 
-    Parameters
-    ----------
-    start : MagnetometerFit, optional
-        Initial estimate; by default the prior's values.
-
-    Raises
-    ------
-    EstimationError
-        Where the graph leaves attitudes undetermined, or the search does not converge.
+    `start`: initial estimate; by default the prior's values. Raises EstimationError where the graph
+    leaves attitudes undetermined, or the search does not converge.
     """
     readings = Readings(epochs, prior)
     first = _start(readings, epochs, start)

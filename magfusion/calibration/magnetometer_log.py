@@ -29,7 +29,7 @@ from magfusion.calibration.magnetometer_start import (
     rival_offset,
     starts,
 )
-from magfusion.calibration.sphere_fit import sphere_fits
+from magfusion.calibration.sphere_fit import FIRST_SIGMA, sphere_fits
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
@@ -51,7 +51,6 @@ SHAKEN = 5  # epochs over which disturbed specific force is looked for
 # Of the sigma by which motion disturbs the vertical: a hand tilts in step with its acceleration,
 # so that many shaken epochs are no more informative than a few.
 IN_STEP = 4.0
-FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
 FIELD_SCALES = (0.05, 20.0)  # by which the first guess of an undeclared field's size may be wrong
 LINEARITY = 2e-5  # of the field; a reading is no better than this, however long the window
 MAX_ITERATIONS = 3
@@ -59,38 +58,21 @@ MAX_ITERATIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class LogCalibration:
-    """A calibration from a log, and the data it is based on.
+    """A calibration from a log, and the data it is based on."""
 
-    Parameters
-    ----------
-    magnetometer : Magnetometer
-        As calibrated.
-    readings : SteadyField
-        Readings used in the graph.
-    field_sigma : float
-        Estimated noise of a reading (T).
-    missing : list of str
-        Descriptions of missing orientations.
-    scale_known : bool
-        Whether the site's Earth field set the scale; else the declared matrix did.
-    spread_unseen : float, optional
-        Standard deviation over mean of the field's magnitude in each half of the log with the
-        calibration of the other half; None where a half is too short.
-    shape_kept : bool
-        Whether the declared shape and offset fit the other half as well, and were kept.
-    rival : ndarray, shape (3,), optional
-        Another offset (T), far from the estimate, that explains the readings nearly as well.
-    """
-
-    magnetometer: Magnetometer
+    magnetometer: Magnetometer  # as calibrated
     graph: GraphFit
     prior: MagnetometerPrior
-    readings: SteadyField
-    field_sigma: float
-    missing: list[str]
-    scale_known: bool
+    readings: SteadyField  # readings used in the graph
+    field_sigma: float  # estimated noise of a reading (T)
+    missing: list[str]  # descriptions of missing orientations
+    scale_known: bool  # whether the site's Earth field set the scale; else the declared matrix did
+    # standard deviation over mean of the field's magnitude in each half of the log with the
+    # calibration of the other half; None where a half is too short
     spread_unseen: float | None
+    # whether the declared shape and offset fit the other half as well, and were kept
     shape_kept: bool
+    # (3,), another offset (T), far from the estimate, that explains the readings nearly as well
     rival: Array | None = None
 
 
@@ -99,21 +81,11 @@ def calibrate_log(
 ) -> LogCalibration:
     """Calibrate the magnetometer of a rotated platform.
 
-    Parameters
-    ----------
-    waveform : Waveform
-        Beacons may transmit; their tones average out.
-    site : Site
-        Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
-    at_stops : bool
-        Use only the stops, of which twelve are needed, with each axis up and down among them.
-
-    Raises
-    ------
-    InputError
-        Where the platform is rotated too little, or has too few stops for ``at_stops``.
-    EstimationError
-        Where the graph has no solution.
+    `waveform`: beacons may transmit; their tones average out. `site`: its sigmas of the
+    magnetometer are the prior, its Earth field sets the scale. `at_stops`: use only the stops, of
+    which twelve are needed, with each axis up and down among them. Raises InputError where the
+    platform is rotated too little, or has too few stops for ``at_stops``; EstimationError where the
+    graph has no solution.
     """
     known = site.platform.magnetometer
     readings = _readings(waveform, imu, site, known, at_stops)

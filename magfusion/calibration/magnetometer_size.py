@@ -16,7 +16,7 @@ from magfusion.calibration.magnetometer import (
     refined,
 )
 from magfusion.calibration.magnetometer_graph import GraphFit, MagnetometerPrior
-from magfusion.calibration.magnetometer_log import LINEARITY, LogCalibration
+from magfusion.calibration.magnetometer_log import LINEARITY, MAX_ITERATIONS, LogCalibration
 from magfusion.calibration.magnetometer_start import DISTINCT_CHI_SQUARE, UNLIKELY, mirrored
 from magfusion.calibration.sphere_fit import (
     FIRST_SIGMA,
@@ -35,24 +35,14 @@ from magfusion.units import DEGREE, Array
 NARROW = 3.0 * DEGREE  # RMS in the second direction; less is turning about no axis
 HOMOGENEOUS = 1e-3  # of the field; what steel changes it by over the length of an arm
 WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
-MAX_ITERATIONS = 3
 
 
 def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     """Calibrate a rotated magnetometer from the magnitude of the field alone.
 
-    Parameters
-    ----------
-    waveform : Waveform
-    site : Site
-        Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
-
-    Raises
-    ------
-    InputError
-        Where it is rotated too little.
-    EstimationError
-        Where the calibration has no solution.
+    `site`: its sigmas of the magnetometer are the prior, its Earth field sets the scale. Raises
+    InputError where it is rotated too little; EstimationError where the calibration has no
+    solution.
     """
     known = site.platform.magnetometer
     readings = distinct_fields(steady_alone(waveform, site), known)

@@ -20,29 +20,17 @@ CAP = 0.5  # largest share of a beacon's power that one contradicting beacon cos
 
 @dataclass(frozen=True, eq=False)
 class MarkedSnapshots(Snapshots):
-    """Phasors of epochs at known marks, and check distances.
+    """Phasors of epochs at known marks, and check distances."""
 
-    Parameters
-    ----------
-    marks_world : ndarray, shape (n, 3)
-        Mark of each epoch (m).
-    mark_sigma : float
-        Of a mark's coordinates and of the placement on it (m).
-    lever_body : ndarray, shape (3,)
-        Point of the platform that is on the mark (m).
-    up_body : ndarray, shape (n, 3)
-        Direction of the specific force at each epoch.
-    distances : tuple of CheckDistance
-    points_world : dict of str to ndarray
-        Marks by their names (m).
-    """
-
+    # (n, 3), mark of each epoch (m)
     marks_world: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    mark_sigma: float = 0.01
+    mark_sigma: float = 0.01  # of a mark's coordinates and of the placement on it (m)
+    # (3,), point of the platform that is on the mark (m)
     lever_body: Array = field(default_factory=lambda: np.zeros(3))
+    # (n, 3), direction of the specific force at each epoch
     up_body: Array = field(default_factory=lambda: np.zeros((0, 3)))
     distances: tuple[CheckDistance, ...] = ()
-    points_world: dict[str, Array] = field(default_factory=dict)
+    points_world: dict[str, Array] = field(default_factory=dict)  # marks by their names (m)
 
     def initial_poses(self) -> tuple[Array, Array]:
         """Return poses on the marks, with the heading that most beacons agree on.

@@ -26,24 +26,13 @@ QUANTISED = 0.5  # share of the samples whose value on one axis is the one befor
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Stretches of a stream.
+    """Stretches of a stream."""
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (n,)
-        (s)
-    mean : ndarray, shape (n, axes)
-    scatter : ndarray, shape (n, axes)
-        Largest one-second standard deviation.
-    change : ndarray, shape (n, axes)
-        Largest change of the mean from one second to the next.
-    """
-
-    begin: Array
-    end: Array
-    mean: Array
-    scatter: Array
-    change: Array
+    begin: Array  # (n,) (s)
+    end: Array  # (n,) (s)
+    mean: Array  # (n, axes)
+    scatter: Array  # (n, axes), largest one-second standard deviation
+    change: Array  # (n, axes), largest change of the mean from one second to the next
 
     def outlying(self) -> BoolArray:
         """Return which stretches are shaken, knocked or frozen relative to the others, (n,)."""
@@ -63,12 +52,7 @@ class Blocks:
 
 
 class RestStream:
-    """Samples of one stream, processed in blocks.
-
-    Parameters
-    ----------
-    axes : int
-    """
+    """Samples of one stream, processed in blocks."""
 
     def __init__(self, axes: int) -> None:
         self.allan = AllanStream(axes)

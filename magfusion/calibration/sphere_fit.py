@@ -52,10 +52,7 @@ class Sphere:
     def minima(self, begun: list[MagnetometerFit]) -> list[tuple[Array, Array, float]]:
         """Return state, covariance (13, 13) and cost of the converged minima.
 
-        Raises
-        ------
-        EstimationError
-            Where no start converges.
+        Raises EstimationError where no start converges.
         """
         start = np.array([[*one.matrix.ravel(), *one.offset, 1.0] for one in begun])
         result = minimise(self.normal, start, absolute=MIN_CHI_SQUARE_GAIN)
@@ -79,10 +76,7 @@ def sphere_fits(
 ) -> list[MagnetometerFit]:
     """Return the fits by the magnitude alone; none where the readings are too few.
 
-    Raises
-    ------
-    EstimationError
-        Where no start converges.
+    Raises EstimationError where no start converges.
     """
     readings = distinct_fields(readings, known)
     if len(readings) < MIN_READINGS:

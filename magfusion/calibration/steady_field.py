@@ -28,24 +28,12 @@ MOST_OF_WINDOW = 0.5  # that may pass without a sample, however long intervals a
 
 @dataclass(frozen=True, eq=False)
 class SteadyField:
-    """Readings averaged over windows.
+    """Readings averaged over windows."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Centre of each window, on the log's clock (s).
-    window : ndarray, shape (n,)
-        Length of each (s).
-    measured_sensor : ndarray, shape (n, 3)
-        Reading at the centre (T).
-    accel_body : ndarray, shape (n, 3)
-        Mean specific force in the axes of the centre (m/s^2).
-    """
-
-    time: Array
-    window: Array
-    measured_sensor: Array
-    accel_body: Array
+    time: Array  # (n,), centre of each window, on the log's clock (s)
+    window: Array  # (n,), length of each (s)
+    measured_sensor: Array  # (n, 3), reading at the centre (T)
+    accel_body: Array  # (n, 3), mean specific force in the axes of the centre (m/s^2)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -54,10 +42,7 @@ class SteadyField:
 def window_length(site: Site) -> float:
     """Return the length of a window (s) over which the tones of a site average out.
 
-    Raises
-    ------
-    InputError
-        Where a tone is too low for that.
+    Raises InputError where a tone is too low for that.
     """
     lowest = min((float(np.min(b.tone_frequencies_hz)) for b in site.beacons), default=np.inf)
     length = max(SHORTEST, PERIODS / lowest)
@@ -74,15 +59,8 @@ def steady_field(
 ) -> SteadyField:
     """Average a waveform over consecutive windows.
 
-    Parameters
-    ----------
-    magnetometer : Magnetometer, optional
-        The current calibration; by default the site's.
-
-    Raises
-    ------
-    InputError
-        Where no window lies in both streams without a gap.
+    `magnetometer`: the current calibration; by default the site's. Raises InputError where no
+    window lies in both streams without a gap.
     """
     length = window_length(site)
     offset = site.platform.imu.time_offset
@@ -97,13 +75,8 @@ def steady_field(
 def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     """Average a waveform without a gyro, over windows that are as short as possible.
 
-    Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is
-    too small.
-
-    Raises
-    ------
-    InputError
-        Where no window remains.
+    Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is too
+    small. Raises InputError where no window remains.
     """
     time = waveform.time
     usual = float(np.median(np.diff(time)))
@@ -137,19 +110,8 @@ def average(
 ) -> SteadyField:
     """Average waveform and specific force over given windows, without those that have a gap.
 
-    Parameters
-    ----------
-    time_offset : float
-        Added to the IMU's stamps (s).
-    magnetometer : Magnetometer
-        Calibration for the rotation of the samples.
-    centre, window : ndarray, shape (n,)
-        (s)
-
-    Raises
-    ------
-    InputError
-        Where no window remains.
+    `time_offset`: added to the IMU's stamps (s). `magnetometer`: calibration for the rotation of
+    the samples. `centre`, `window` (n,) (s). Raises InputError where no window remains.
     """
     imu_time = imu.time + time_offset
     whole = _whole(waveform.time, centre, window) & _whole(imu_time, centre, window)

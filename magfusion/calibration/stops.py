@@ -16,14 +16,9 @@ SAME = 10.0 * DEGREE  # stops whose vertical and turn differ by less are one ori
 
 @dataclass(frozen=True, eq=False)
 class Stops:
-    """Stationary intervals of the platform.
+    """Stationary intervals of the platform."""
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (n,)
-        (s), the IMU's stamps.
-    """
-
+    # begin, end: (n,) (s), the IMU's stamps
     begin: Array
     end: Array
 
@@ -44,15 +39,8 @@ class Stops:
 def find_stops(imu: ImuSamples, motion: MotionModel) -> Stops:
     """Find sufficiently long stationary intervals.
 
-    Parameters
-    ----------
-    motion : MotionModel
-        Defines rest.
-
-    Returns
-    -------
-    Stops
-        In order of time; a slow even rotation, which scatters as little as rest, is excluded.
+    `motion`: defines rest. Returned in order of time; a slow even rotation, which scatters as
+    little as rest, is excluded.
     """
     still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))

@@ -17,34 +17,19 @@ NEAR = 30.0 * DEGREE
 
 @dataclass(frozen=True, eq=False)
 class TurnStatus:
-    """State of a guided rotation.
+    """State of a guided rotation."""
 
-    Parameters
-    ----------
-    time : float
-        Since the first sample (s).
-    now : ndarray, shape (3,), optional
-        Direction of the vertical, or of the field without an IMU, in sensor axes.
-    visited : ndarray of bool, shape (26,)
-        Of `DIRECTIONS`.
-    missing : list of str
-        Sentences on the axes that were never along the vertical, or the field.
-    target : str
-        Which orientation is next; empty if all are visited.
-    offset_sigma, matrix_sigma : float, optional
-        Largest sigma of the estimate, that of the matrix times the field (T); None before it.
-    reason : str
-        Why there is no estimate, or why it is rejected.
-    """
-
-    time: float
+    time: float  # since the first sample (s)
+    # (3,), direction of the vertical, or of the field without an IMU, in sensor axes
     now: Array | None
-    visited: BoolArray
-    missing: list[str]
-    target: str
+    visited: BoolArray  # (26,), of `DIRECTIONS`
+    missing: list[str]  # sentences on the axes that were never along the vertical, or the field
+    target: str  # which orientation is next; empty if all are visited
+    # offset_sigma, matrix_sigma: largest sigma of the estimate, that of the matrix times the field
+    # (T); None before it
     offset_sigma: float | None = None
     matrix_sigma: float | None = None
-    reason: str = ""
+    reason: str = ""  # why there is no estimate, or why it is rejected
 
     @property
     def complete(self) -> bool:
@@ -55,10 +40,7 @@ class TurnStatus:
 class TurnCoverage:
     """Directions that a vector of the world had in a sensor.
 
-    Parameters
-    ----------
-    vertical : bool
-        Whether it is the vertical; else it is the magnetic field.
+    `vertical`: whether it is the vertical; else it is the magnetic field.
     """
 
     def __init__(self, vertical: bool) -> None:

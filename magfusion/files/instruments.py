@@ -24,11 +24,10 @@ from pydantic import Field, RootModel, model_validator
 from magfusion.errors import InputError
 from magfusion.files.yaml_files import StrictModel, read_yaml
 from magfusion.model.site import ImuModel
-from magfusion.units import DEGREE
+from magfusion.units import DEGREE, HOUR
 
 TURNS, DEFAULT_TURNS = 1000.0, 100.0  # s
 MICRO_G = 9.80665e-6  # m/s^2
-HOUR = 3600.0  # s
 UNNAMED = "MEMS"  # what is taken where nothing is named
 BODY_IRON = 2e-6  # T; iron on the body offsets any magnetometer by about that
 

@@ -14,13 +14,12 @@ from magfusion.errors import InputError
 from magfusion.files.result_states import ResultStates
 from magfusion.model.fixed_axes import fixed_axes_covariance
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array
+from magfusion.units import NS_PER_S, Array
 
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped"
 # ROS has no word for "not known", and who fuses takes a zero for certain.
 UNKNOWN_VARIANCE = 1e6  # m^2, rad^2, and a second's of them
-_NS = 1_000_000_000
-_LAST_STAMP = (1 << 31) * _NS  # of builtin_interfaces/Time, whose seconds have 31 bits
+_LAST_STAMP = (1 << 31) * NS_PER_S  # of builtin_interfaces/Time, whose seconds have 31 bits
 _STORAGES = {"mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}
 
 
@@ -88,7 +87,7 @@ def _messages(states: ResultStates, frames: Frames, types: Any) -> Iterator[tupl
         velocity = np.einsum("nji,nj->ni", result.world_from_body, result.velocity_world)
     vector, unknown = types["geometry_msgs/msg/Vector3"], (UNKNOWN_VARIANCE * np.eye(6)).ravel()
     for k, stamp in enumerate(states.stamp_ns.tolist()):
-        time = types["builtin_interfaces/msg/Time"](*divmod(stamp, _NS))
+        time = types["builtin_interfaces/msg/Time"](*divmod(stamp, NS_PER_S))
         header = types["std_msgs/msg/Header"](time, frames.world)
         pose = types["geometry_msgs/msg/PoseWithCovariance"](
             types["geometry_msgs/msg/Pose"](

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from magfusion.files.instruments import UNNAMED, ImuSheet, MagnetometerSheet
 from magfusion.files.site_draft import BeaconDraft, Numbers, Place
+from magfusion.units import STANDARD_GRAVITY
 
 # What a survey by hand is worth, one sigma.
 POSITION_SIGMA = 0.05  # m, with a tape
@@ -14,7 +15,6 @@ MOUNTING_SIGMA, LEVER_SIGMA = 2.0, 0.01  # degrees, m
 MODEL_ERROR = 0.005  # of a room without much steel
 # What is taken where nothing is said.
 GUESSED_MOMENT, GUESSED_MOMENT_SIGMA = 100.0, 1.0  # A m^2, a factor of e
-STANDARD_GRAVITY = 9.80665  # m/s^2
 COMMENT_AT = 46  # column
 TO_DO = "TO DO"
 _MISSING = {"pose": "position_m and rpy_deg", "position": "position_m", "attitude": "rpy_deg"}

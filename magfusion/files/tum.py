@@ -14,11 +14,11 @@ from magfusion.files.atomic import whole_file
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.trajectory import Trajectory
+from magfusion.units import NS_PER_S
 
 _COLUMNS = "time_s x y z qx qy qz qw"
 _POSITIONS = "time_s x y z"
 _EIGHT = f"eight finite numbers: {_COLUMNS}"
-_NS_PER_S = 1_000_000_000
 
 
 def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
@@ -87,7 +87,7 @@ def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
 
 def _stamp(path: Path, number: int, text: str) -> int:
     try:
-        stamp = round(Decimal(text.split()[0]) * _NS_PER_S)
+        stamp = round(Decimal(text.split()[0]) * NS_PER_S)
     except InvalidOperation:
         stamp = LARGEST_TIME_NS + 1
     if abs(stamp) > LARGEST_TIME_NS:

@@ -18,14 +18,14 @@ from magfusion.model.progress import Report
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
 STREAM_TESTS = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
 # Stamps contain little noise if evenly sampled; missing samples are tracked.
 TOLERATED_CODES = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
 MOST_LOST = 0.05  # share of the samples, from which it matters after all
 MOVED = 0.2  # share of the time, from which it was no rest
-STANDARD_GRAVITY, GRAVITY_UNSURE = 9.80665, 0.03  # m/s^2, without a site
+GRAVITY_UNSURE = 0.03  # m/s^2, of the standard one, without a site
 DENSITY = np.sqrt(2.0)  # one-sided density over what an Allan deviation shows
 HALF = 0.5
 # Signature of steps larger than the noise.

@@ -9,6 +9,7 @@ import numpy as np
 from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, read_survey
 from magfusion.jobs.receiver_axes import three_axes
@@ -23,7 +24,6 @@ from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 
 LONGEST_GAP = 1.0  # s, of the trajectory that is interpolated across
-SAME_TIME = 1e-6  # s
 MOST_POINTS = 600  # the posterior takes the cube of their number
 UNEXPLAINED = 0.3  # relative error of the mapped field, from which it contradicts the site
 WORSE = 1.2  # the same with the map by that without it

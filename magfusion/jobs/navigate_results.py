@@ -11,8 +11,8 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.correction import CAUSE_FIRST
 from magfusion.estimation.integrity.diagnosis import (
+    CAUSE_FIRST,
     diagnosed,
     with_corrected,
     with_explaining_cause,

@@ -12,7 +12,7 @@ from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.estimation.graph.state import GYRO_BIAS, ROTATION
 from magfusion.estimation.online_integrity.judgement import JudgedState
-from magfusion.estimation.orientation.layout import LAG, MICROTESLA, OFFSET, Orientation
+from magfusion.estimation.orientation.layout import LAG, OFFSET, Orientation
 from magfusion.estimation.orientation.online import ANYWHERE, TIMING, OrientationNavigator
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
@@ -36,7 +36,7 @@ from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
 from magfusion.results.report import write_report
 from magfusion.results.verdict import trust_figures
-from magfusion.units import DEGREE, Array, Rate
+from magfusion.units import DEGREE, MICROTESLA, Array, Rate
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:

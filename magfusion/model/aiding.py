@@ -26,18 +26,11 @@ def _zero() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AidingSigma:
-    """Prior standard deviations of the parameters of an aiding sensor.
+    """Prior standard deviations of the parameters of an aiding sensor."""
 
-    Parameters
-    ----------
-    position_body, rotation_sensor : ndarray, shape (3,)
-        (m, rad)
-    scale, offset, time_offset : ndarray, shape ()
-        Of a scale factor, in the unit of the measurement, and (s).
-    """
-
-    position_body: Array = field(default_factory=lambda: np.zeros(3))
-    rotation_sensor: Array = field(default_factory=lambda: np.zeros(3))
+    position_body: Array = field(default_factory=lambda: np.zeros(3))  # (3,) (m)
+    rotation_sensor: Array = field(default_factory=lambda: np.zeros(3))  # (3,) (rad)
+    # scale, offset, time_offset: (), of a scale factor, in the unit of the measurement, and (s)
     scale: Array = field(default_factory=_zero)
     offset: Array = field(default_factory=_zero)
     time_offset: Array = field(default_factory=_zero)
@@ -45,63 +38,39 @@ class AidingSigma:
 
 @dataclass(frozen=True, eq=False)
 class AidingSensor:
-    """One aiding sensor, which measures in the SI unit of its quantity.
-
-    Parameters
-    ----------
-    quantity : str
-        ``velocity`` of the sensor in its own axes (m/s); ``range`` to ``point_world`` (m);
-        ``position`` (m), or that of a named ``mark`` on which the sensor is; ``height`` above the
-        world's zero (m), or as a ``pressure`` (Pa); ``heading`` of the body's x axis, clockwise
-        from the world's y axis (rad); ``relative_pose`` of the sensor since an earlier time (m).
-    sigma : float
-        Of white noise.
-    relative_sigma : float
-        Noise of a velocity or translation as a share of its size.
-    constraint_sigma : float, optional
-        Standard deviation about zero of the axes of a velocity that are not measured, as of wheels
-        that do not slide (nonholonomic constraint, m/s).
-    position_body : ndarray, shape (3,)
-        Lever arm (m).
-    body_from_sensor : ndarray, shape (3, 3)
-    point_world : ndarray, shape (3,), optional
-        (m)
-    marks_world : mapping, optional
-        Positions of the marks by their names, shape (3,) (m).
-    scale, offset : ndarray, shape ()
-        ``measured = scale * true + offset``; of a pressure, the true value is a height.
-    offset_walk : float
-        Standard deviation that the offset gains in an hour.
-    time_offset : ndarray, shape ()
-        A sample stamped t was measured at t + time_offset (s).
-    rate_hz : float
-        Greatest rate of the samples that are used; others are left out.
-    origin : tuple of float, optional
-        Latitude, longitude (degrees) and ellipsoidal height (m) of the world's origin, for
-        positions of GNSS; the world's axes are east, north and up there.
-    rotation_sigma : float
-        Of the rotation of a relative pose (rad).
-    """
+    """One aiding sensor, which measures in the SI unit of its quantity."""
 
     __repr__ = short_repr
 
     name: str
+    # ``velocity`` of the sensor in its own axes (m/s); ``range`` to ``point_world`` (m);
+    # ``position`` (m), or that of a named ``mark`` on which the sensor is; ``height`` above the
+    # world's zero (m), or as a ``pressure`` (Pa); ``heading`` of the body's x axis, clockwise from
+    # the world's y axis (rad); ``relative_pose`` of the sensor since an earlier time (m)
     quantity: Quantity
-    sigma: float
-    relative_sigma: float = 0.0
+    sigma: float  # of white noise
+    relative_sigma: float = 0.0  # noise of a velocity or translation as a share of its size
+    # standard deviation about zero of the axes of a velocity that are not measured, as of wheels
+    # that do not slide (nonholonomic constraint, m/s)
     constraint_sigma: float | None = None
-    position_body: Array = field(default_factory=lambda: np.zeros(3))
-    body_from_sensor: Array = field(default_factory=lambda: np.eye(3))
-    point_world: Array | None = None
+    position_body: Array = field(default_factory=lambda: np.zeros(3))  # (3,), lever arm (m)
+    body_from_sensor: Array = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    point_world: Array | None = None  # (3,) (m)
+    # positions of the marks by their names, shape (3,) (m)
     marks_world: Mapping[str, Array] = field(default_factory=dict)
+    # scale, offset: (), ``measured = scale * true + offset``; of a pressure, the true value is a
+    # height
     scale: Array = field(default_factory=lambda: np.ones(()))
     offset: Array = field(default_factory=_zero)
-    offset_walk: float = 0.0
+    offset_walk: float = 0.0  # standard deviation that the offset gains in an hour
+    # (), a sample stamped t was measured at t + time_offset (s)
     time_offset: Array = field(default_factory=_zero)
-    rate_hz: float = AIDING_RATE
+    rate_hz: float = AIDING_RATE  # greatest rate of the samples that are used; others are left out
     sigmas: AidingSigma = field(default_factory=AidingSigma)
+    # latitude, longitude (degrees) and ellipsoidal height (m) of the world's origin, for positions
+    # of GNSS; the world's axes are east, north and up there
     origin: tuple[float, float, float] | None = None
-    rotation_sigma: float = 0.0
+    rotation_sigma: float = 0.0  # of the rotation of a relative pose (rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +133,7 @@ def sensor_named(
 ) -> AidingSensor:
     """Return an aiding sensor of a site by its name, and its quantity if that is known.
 
-    Raises
-    ------
-    InputError
-        If the site has no such sensor.
+    Raises InputError if the site has no such sensor.
     """
     known = {sensor.name: sensor for sensor in sensors}
     if name not in known:

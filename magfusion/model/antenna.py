@@ -27,29 +27,16 @@ class Antenna:
     """A transmitting and a receiving antenna of three coils each.
 
     Leading axes, the same in all fields, hold many antennas.
-
-    Parameters
-    ----------
-    moments_beacon : ndarray, shape (..., 3, 3)
-        Of each transmitting coil, beacon axes (A m^2).
-    centres_beacon : ndarray, shape (..., 3, 3)
-        Of each transmitting coil (m).
-    sensitivities_sensor : ndarray, shape (..., 3, 3)
-        Of each receiving coil, sensor axes: the rows of the magnetometer's matrix.
-    centres_sensor : ndarray, shape (..., 3, 3)
-        Of each receiving coil (m).
-    kappa_beacon : ndarray, shape (..., 3), optional
-        Finite size of each transmitting coil (m^2, `magfusion.model.physics.finite_size`).
-    kappa_sensor : ndarray, shape (...), optional
-        Of the receiving coils.  Both or neither.
     """
 
-    moments_beacon: Array
-    centres_beacon: Array
+    moments_beacon: Array  # (..., 3, 3), of each transmitting coil, beacon axes (A m^2)
+    centres_beacon: Array  # (..., 3, 3), of each transmitting coil (m)
+    # (..., 3, 3), of each receiving coil, sensor axes: the rows of the magnetometer's matrix
     sensitivities_sensor: Array
-    centres_sensor: Array
+    centres_sensor: Array  # (..., 3, 3), of each receiving coil (m)
+    # (..., 3), finite size of each transmitting coil (m^2, `magfusion.model.physics.finite_size`)
     kappa_beacon: Array | None = None
-    kappa_sensor: Array | None = None
+    kappa_sensor: Array | None = None  # (...), of the receiving coils. Both or neither
 
     def vector(self) -> Array:
         """Return the parameters as one vector, shape (..., 36), or (..., 40) with finite size."""
@@ -87,10 +74,8 @@ def antenna_from_vector(vector: Array) -> Antenna:
 def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
     """Return the declared antenna of a site; without sizes where no coil has one.
 
-    Raises
-    ------
-    InputError
-        Where the beacon does not have three coils, each alone in its tone or time slot.
+    Raises InputError where the beacon does not have three coils, each alone in its tone or time
+    slot.
     """
     if len(beacon.coils) != 3 or len(beacon.tones) != 3:
         raise InputError(
@@ -111,21 +96,12 @@ def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
 
 
 class Coupling(NamedTuple):
-    """Predicted couplings with their Jacobian blocks.
+    """Predicted couplings with their Jacobian blocks."""
 
-    Parameters
-    ----------
-    value : ndarray, shape (..., 3, 3)
-        Rows are receiving coils, columns transmitting ones (T).
-    pose : ndarray, shape (..., 3, 3, 6)
-        Right perturbation of beacon_from_sensor: rotation, translation, sensor axes.
-    antenna : ndarray, shape (..., 3, 3, 36) or (..., 3, 3, 40)
-        With respect to `Antenna.vector`.
-    """
-
-    value: Array
+    value: Array  # (..., 3, 3), rows are receiving coils, columns transmitting ones (T)
+    # (..., 3, 3, 6), right perturbation of beacon_from_sensor: rotation, translation, sensor axes
     pose: Array
-    antenna: Array
+    antenna: Array  # (..., 3, 3, 36) or (..., 3, 3, 40), with respect to `Antenna.vector`
 
 
 def observe_antenna(
@@ -134,14 +110,8 @@ def observe_antenna(
     """Predict the couplings of all pairs of coils, with the Jacobian in the same call.
 
     ``y_ij = s_i . R^T G(p + R b_i - c_j) m_j`` with R, p the sensor's pose in beacon axes.
-
-    Parameters
-    ----------
-    antenna : Antenna
-        Leading axes broadcast against those of the poses.
-    beacon_from_sensor : ndarray, shape (..., 3, 3)
-    position_beacon : ndarray, shape (..., 3)
-        Origin of the sensor (m).
+    `antenna`: leading axes broadcast against those of the poses. `beacon_from_sensor` (..., 3, 3).
+    `position_beacon` (..., 3): origin of the sensor (m).
     """
     turn = np.swapaxes(beacon_from_sensor, -1, -2)  # row vectors: beacon = sensor @ turn
     in_beacon = antenna.sensitivities_sensor @ turn

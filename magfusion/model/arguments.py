@@ -6,15 +6,8 @@ from itertools import permutations
 def check_arguments(function: str, **arguments: tuple[object, type]) -> None:
     """Reject arguments of wrong types; the keywords are the function's parameters, in order.
 
-    Parameters
-    ----------
-    **arguments : (object, type)
-        The value, and its required type.
-
-    Raises
-    ------
-    TypeError
-        In one sentence, which reports swapped arguments.
+    `**arguments`: the value, and its required type. Raises TypeError in one sentence, which reports
+    swapped arguments.
     """
     given = [value for value, _ in arguments.values()]
     wanted = [kind for _, kind in arguments.values()]

@@ -27,28 +27,16 @@ MIN_SPACING_HZ = 2.0 * PASS_HZ + NARROWEST_HZ
 
 @dataclass(frozen=True, eq=False)
 class BandFilter:
-    """Filter of the bands of a site's tones at a sampling rate.
+    """Filter of the bands of a site's tones at a sampling rate."""
 
-    Parameters
-    ----------
-    tones_hz : ndarray, shape (tones,)
-    rate_hz : float
-        Of the recording.
-    decimation : int
-        Samples of the recording for each that is kept.
-    taps : complex ndarray, shape (length, tones)
-        Of the analytic signal in the middle of its samples, which are those of the first stage.
-    first_step : int
-        Samples of the recording for each of a first stage, which passes all bands.
-    first_taps : ndarray, shape (length,)
-    """
-
-    tones_hz: Array
-    rate_hz: float
-    decimation: int
+    tones_hz: Array  # (tones,)
+    rate_hz: float  # of the recording
+    decimation: int  # samples of the recording for each that is kept
+    # (length, tones), of the analytic signal in the middle of its samples, which are those of the
+    # first stage
     taps: ComplexArray
-    first_step: int
-    first_taps: Array
+    first_step: int  # samples of the recording for each of a first stage, which passes all bands
+    first_taps: Array  # (length,)
 
     @property
     def middle(self) -> int:
@@ -124,17 +112,8 @@ class BandSampler:
     def push(self, block: Array) -> tuple[Array, ComplexArray]:
         """Return places and analytic signals of the samples that a block completes.
 
-        Parameters
-        ----------
-        block : ndarray, shape (n, columns)
-            The next samples.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Number of the recording's sample at which each is.
-        complex ndarray, shape (m, tones, columns)
-            Its real part is the waveform of each tone's band.
+        `block` (n, columns): the next samples. Returns (m,): number of the recording's sample at
+        which each is; (m, tones, columns): its real part is the waveform of each tone's band.
         """
         if self._band.first_step > 1:
             block = self._first.push(block)[..., 0]
@@ -166,10 +145,7 @@ class _Windows:
 def waveform_of_bands(time: Array, baseband: ComplexArray, tones_hz: Array) -> Array:
     """Return the waveform at its times from the complex amplitudes of tones, shape (n, 3).
 
-    Parameters
-    ----------
-    baseband : complex ndarray, shape (n, tones, 3)
-        Field of each tone is the real part of it times ``exp(j 2 pi f t)``.
+    `baseband` (n, tones, 3): field of each tone is the real part of it times ``exp(j 2 pi f t)``.
     """
     turn = np.exp(2j * np.pi * time[:, None] * tones_hz)
     return np.real(np.einsum("nt,nti->ni", turn, baseband))

@@ -10,17 +10,9 @@ PAUSE = 3.0  # times the usual time between batches: a gap, over which nothing i
 def spread_batches(stamps: Array, last: IntArray) -> Array:
     """Spread the samples of each batch evenly over the time since the batch before.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (n,)
-        Times of arrival (s), not decreasing.
-    last : ndarray of int, shape (batches,)
-        The last sample of each batch, which keeps its stamp; two batches at least.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Strictly increasing (s), accurate to one step.
+    `stamps` (n,): times of arrival (s), not decreasing. `last` (batches,): the last sample of each
+    batch, which keeps its stamp; two batches at least. Returns (n,): strictly increasing (s),
+    accurate to one step.
     """
     count = np.diff(last, prepend=-1)
     between = np.diff(stamps[last])

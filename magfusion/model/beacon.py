@@ -19,34 +19,20 @@ Unknown = Literal["pose", "position", "attitude"]
 
 @dataclass(frozen=True, eq=False)
 class Coil:
-    """One coil of a beacon, driven by ``cos(2 pi f t + phase)``.
+    """One coil of a beacon, driven by ``cos(2 pi f t + phase)``."""
 
-    Parameters
-    ----------
-    moment_beacon : ndarray, shape (3,)
-        Peak moment (A m^2).
-    phase : float
-        Drive phase relative to the log clock (rad).
-    centre_beacon : ndarray, shape (3,)
-        Magnetic centre relative to the beacon's origin (m).
-    radius, length : float, optional
-        Finite size (m), see `magfusion.model.coil_field`; None for a dipole.
-    frequency_hz : float, optional
-        Drive frequency where it differs from the beacon's (frequency division).
-    slot : int, optional
-        Time slot, counted from 0, where coils are driven in turn (time division).
-    current : float, optional
-        Peak current of the declared moment (A).
-    """
-
-    moment_beacon: Array
-    phase: float = 0.0
+    moment_beacon: Array  # (3,), peak moment (A m^2)
+    phase: float = 0.0  # drive phase relative to the log clock (rad)
+    # (3,), magnetic centre relative to the beacon's origin (m)
     centre_beacon: Array = field(default_factory=lambda: np.zeros(3))
+    # radius, length: finite size (m), see `magfusion.model.coil_field`; None for a dipole
     radius: float | None = None
     length: float | None = None
+    # drive frequency where it differs from the beacon's (frequency division)
     frequency_hz: float | None = None
+    # time slot, counted from 0, where coils are driven in turn (time division)
     slot: int | None = None
-    current: float | None = None
+    current: float | None = None  # peak current of the declared moment (A)
 
 
 def rotor_coils(rotor: Rotor, frequency_hz: float) -> tuple[Coil, ...]:
@@ -64,80 +50,44 @@ def rotor_coils(rotor: Rotor, frequency_hz: float) -> tuple[Coil, ...]:
 
 @dataclass(frozen=True, eq=False)
 class BeaconSigma:
-    """Prior standard deviations of a beacon's calibration; zero means known.
+    """Prior standard deviations of a beacon's calibration; zero means known."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,)
-        Of the centre, world axes (m).
-    rotation_beacon : ndarray, shape (3,)
-        Of the attitude, beacon axes (rad).
-    log_moment : ndarray, shape (coils,)
-        Of the natural logarithm of each coil's moment.
-    """
-
-    position_world: Array
-    rotation_beacon: Array
-    log_moment: Array
+    position_world: Array  # (3,), of the centre, world axes (m)
+    rotation_beacon: Array  # (3,), of the attitude, beacon axes (rad)
+    log_moment: Array  # (coils,), of the natural logarithm of each coil's moment
 
 
 @dataclass(frozen=True, eq=False)
 class Beacon:
-    """A magnetic source: one or more coils on a common rigid frame.
-
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,)
-        Surveyed centre (m).
-    world_from_beacon : ndarray, shape (3, 3)
-        Rotation of the coil axes.
-    synchronised : bool
-        False where the drive phase relative to the log clock is unknown and drifts.
-    field_map : FieldMap, optional
-        Deviation of its field from the model where it was surveyed.
-    steel : SteelField, optional
-        What the steel of the room adds to its field.
-    slots : Slots or MarkedSlots, optional
-        Time slots of its coils, if driven in turn on a known schedule; a frequency of zero then
-        means pulses of direct current.
-    unknown : {"pose", "position", "attitude"}, optional
-        Unsurveyed part, to be estimated from a log; its values are NaN.
-    model_error : float, optional
-        Of its own field; the site's if None.
-    noise_factor : float
-        Noise of its phasors relative to that measured near its tones.
-    temperature_model : MomentTemperatureModel, optional
-        Temperature dependence of its moments.
-    hemisphere_beacon : ndarray, shape (3,), optional
-        Direction, of any length, of the half space that contains the magnetometer.
-    conductivity : float
-        Of the surrounding ground or water (S/m), uniform, isotropic and unbounded; equal for all
-        beacons of a site.
-    rotor : Rotor, optional
-        Magnet on a shaft from which its coils are derived.
-    planned : bool
-        Whether its frequency is not chosen yet, so that it is shared with no other beacon.
-    """
+    """A magnetic source: one or more coils on a common rigid frame."""
 
     __repr__ = short_repr
 
     name: str
-    position_world: Array
-    world_from_beacon: Array
+    position_world: Array  # (3,), surveyed centre (m)
+    world_from_beacon: Array  # (3, 3), rotation of the coil axes
     frequency_hz: float
     coils: tuple[Coil, ...]
+    # False where the drive phase relative to the log clock is unknown and drifts
     synchronised: bool
     sigma: BeaconSigma
-    field_map: FieldMap | None = None
-    steel: SteelField | None = None
+    field_map: FieldMap | None = None  # deviation of its field from the model where it was surveyed
+    steel: SteelField | None = None  # what the steel of the room adds to its field
+    # time slots of its coils, if driven in turn on a known schedule; a frequency of zero then means
+    # pulses of direct current
     slots: Slots | MarkedSlots | None = None
+    # unsurveyed part, to be estimated from a log; its values are NaN
     unknown: Unknown | None = None
-    model_error: float | None = None
-    noise_factor: float = 1.0
+    model_error: float | None = None  # of its own field; the site's if None
+    noise_factor: float = 1.0  # noise of its phasors relative to that measured near its tones
+    # (3,), direction, of any length, of the half space that contains the magnetometer
     hemisphere_beacon: Array | None = None
-    temperature_model: MomentTemperatureModel | None = None
+    temperature_model: MomentTemperatureModel | None = None  # temperature dependence of its moments
+    # of the surrounding ground or water (S/m), uniform, isotropic and unbounded; equal for all
+    # beacons of a site
     conductivity: float = 0.0
-    rotor: Rotor | None = None
+    rotor: Rotor | None = None  # magnet on a shaft from which its coils are derived
+    # whether its frequency is not chosen yet, so that it is shared with no other beacon
     planned: bool = False
 
     @cached_property

@@ -18,16 +18,8 @@ def are_driven(site: Site) -> bool:
 def driven(site: Site, time: Array) -> tuple[Array, Array] | None:
     """Return the effect of recorded currents on channels.
 
-    Parameters
-    ----------
-    time : ndarray, shape (...)
-        (s)
-
-    Returns
-    -------
-    tuple of ndarray, or None, each of shape (..., channels)
-        Increase of the logarithms of amplitudes, and phase lead against those declared (rad);
-        None where no current was recorded.
+    `time` (...) (s). Returns (..., channels) each: increase of the logarithms of amplitudes, and
+    phase lead against those declared (rad); None where no current was recorded.
     """
     if not are_driven(site):
         return None
@@ -84,15 +76,8 @@ def of_all_sensors(site: Site, by_tone: Array) -> Array:
 def warmed(site: Site, time: Array) -> Array | None:
     """Return the increase of the logarithm of each channel's moments by temperature.
 
-    Parameters
-    ----------
-    time : ndarray, shape (...)
-        (s)
-
-    Returns
-    -------
-    ndarray or None, shape (..., channels)
-        None where no coefficient is declared, or no temperature measured.
+    `time` (...) (s). Returns (..., channels); None where no coefficient is declared, or no
+    temperature measured.
     """
     known = site.temperatures
     if known is None or all(beacon.temperature_model is None for beacon in site.beacons):

@@ -5,17 +5,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CheckDistance:
-    """Distance between two beacons, or a beacon and a mark, measured by tape.
+    """Distance between two beacons, or a beacon and a mark, measured by tape."""
 
-    Parameters
-    ----------
-    begin, end : str
-        Names.
-    distance, sigma : float
-        (m)
-    """
-
+    # begin, end: names
     begin: str
     end: str
-    distance: float
-    sigma: float
+    distance: float  # (m)
+    sigma: float  # (m)

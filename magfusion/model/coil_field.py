@@ -45,33 +45,18 @@ class Loops(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """Beacon, or several of one form, as arrays that broadcast against points.
+    """Beacon, or several of one form, as arrays that broadcast against points."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,) or (beacons, 1, 3)
-        (m)
-    world_from_beacon : ndarray, shape (3, 3) or (beacons, 3, 3)
-    excitation : complex ndarray, shape (coils, tones) or (beacons, 1, coils, tones)
-        As of `magfusion.model.site.Beacon`.
-    loops : Loops
-    concentric : bool
-        All coils of a beacon are at one place.
-    field_map : FieldMap, optional
-        Of one beacon.
-    steel : SteelField, optional
-        Of one beacon.
-    decay : complex ndarray, shape (loops,) or (beacons, 1, loops), optional
-        Of each loop's field in conducting ground (1/m); None without conduction.
-    """
-
-    position_world: Array
-    world_from_beacon: Array
+    position_world: Array  # (3,) or (beacons, 1, 3) (m)
+    world_from_beacon: Array  # (3, 3) or (beacons, 3, 3)
+    # (coils, tones) or (beacons, 1, coils, tones), as of `magfusion.model.site.Beacon`
     excitation: ComplexArray
     loops: Loops
-    concentric: bool
-    field_map: FieldMap | None = None
-    steel: SteelField | None = None
+    concentric: bool  # all coils of a beacon are at one place
+    field_map: FieldMap | None = None  # of one beacon
+    steel: SteelField | None = None  # of one beacon
+    # (loops,) or (beacons, 1, loops), of each loop's field in conducting ground (1/m); None without
+    # conduction
     decay: ComplexArray | None = None
 
     @property
@@ -117,12 +102,8 @@ def _decay(beacon: Beacon) -> ComplexArray:
 def side_by_side(site: Site) -> Groups:
     """Return a site's beacons in few sources: those of one form together, mapped ones alone.
 
-    With few points, the field of several beacons costs as much as that of one.
-
-    Returns
-    -------
-    tuple
-        Indices of beacons, and their source.
+    With few points, the field of several beacons costs as much as that of one. Returns indices of
+    beacons, and their source.
     """
     known = _GROUPS.get(site)
     if known is None:
@@ -217,15 +198,8 @@ def _slices(coil: Coil) -> tuple[Array, Array]:
 def coil_fields(source: Sources, offset_beacon: Array) -> AnyArray:
     """Return the field of each coil at its peak current.
 
-    Parameters
-    ----------
-    offset_beacon : ndarray, shape (..., 3) or (beacons, n, 3)
-        From the beacon's origin, beacon axes (m).
-
-    Returns
-    -------
-    ndarray, shape (..., coils, 3)
-        Beacon axes (T); complex where the ground conducts.
+    `offset_beacon` (..., 3) or (beacons, n, 3): from the beacon's origin, beacon axes (m). Returns
+    (..., coils, 3): beacon axes (T); complex where the ground conducts.
     """
     loops = source.loops
     offset = offset_beacon[..., None, :] - loops.centre
@@ -242,10 +216,7 @@ def coil_fields(source: Sources, offset_beacon: Array) -> AnyArray:
 def coil_fields_by_log_conductivity(source: Sources, offset_beacon: Array) -> ComplexArray | None:
     """Return the derivative of `coil_fields` by the logarithm of the ground's conductivity.
 
-    Returns
-    -------
-    complex ndarray, shape (..., coils, 3)
-        Beacon axes (T); None without conduction.
+    Returns (..., coils, 3): beacon axes (T); None without conduction.
     """
     if source.decay is None:
         return None
@@ -260,19 +231,9 @@ def coil_fields_by_log_conductivity(source: Sources, offset_beacon: Array) -> Co
 def coil_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[AnyArray, AnyArray]:
     """Return the field of each coil at its peak current, with its gradient.
 
-    Parameters
-    ----------
-    offset_beacon : ndarray, shape (..., 3) or (beacons, n, 3)
-        From the beacon's origin, beacon axes (m).
-
-    Returns
-    -------
-    field : ndarray, shape (..., coils, 3)
-        Beacon axes (T).
-    gradient : ndarray, shape (..., coils, 3, 3)
-        ``[i, j] = d field_i / d offset_j`` (T/m).
-
-    Both are complex where the ground conducts.
+    `offset_beacon` (..., 3) or (beacons, n, 3): from the beacon's origin, beacon axes (m). Returns
+    `field` (..., coils, 3): beacon axes (T); `gradient` (..., coils, 3, 3): ``[i, j] = d field_i /
+    d offset_j`` (T/m).
     """
     loops = source.loops
     offset = offset_beacon[..., None, :] - loops.centre
@@ -312,18 +273,10 @@ def _in_room(source: Sources, offset_beacon: Array) -> Array:
 
 
 class Driven(NamedTuple):
-    """Field of coils with known currents.
+    """Field of coils with known currents."""
 
-    Parameters
-    ----------
-    field : ndarray, shape (n, 3)
-        (T)
-    along : ndarray, shape (n, 3), optional
-        Its derivative along a displacement (T per unit of it).
-    """
-
-    field: Array
-    along: Array | None
+    field: Array  # (n, 3) (T)
+    along: Array | None  # (n, 3), its derivative along a displacement (T per unit of it)
 
 
 def driven_dipoles(
@@ -331,23 +284,14 @@ def driven_dipoles(
 ) -> Driven:
     """Return the field of coils without a size; concentric ones are summed to one moment.
 
-    Parameters
-    ----------
-    offset_beacon : ndarray, shape (..., n, 3)
-        From the beacon's origin, beacon axes (m).
-    current : ndarray, shape (..., n, coils)
-        Of each coil, as a share of its peak.
-    along_beacon : ndarray, shape (..., n, 3), optional
-        A displacement of the points.
-
-    Returns
-    -------
-    Driven
-        Beacon axes.
+    `offset_beacon` (..., n, 3): from the beacon's origin, beacon axes (m).
+    `current` (..., n, coils): of each coil, as a share of its peak. `along_beacon` (..., n, 3): a
+    displacement of the points. Returned in beacon axes.
     """
     centre, moments = source.loops.centre, source.loops.moment
     if source.concentric:
-        moment, offset = current @ _of_matrices(moments), offset_beacon - centre[..., 0, :]
+        of_beacon = moments[..., 0, :, :] if moments.ndim > 2 else moments  # without points' axis
+        moment, offset = current @ of_beacon, offset_beacon - centre[..., 0, :]
         by = None if along_beacon is None else dipole_field_along(offset, moment, along_beacon)
         return Driven(dipole_field(offset, moment), by)
     moment, offset = current[..., None] * moments, offset_beacon[..., None, :] - centre
@@ -356,8 +300,3 @@ def driven_dipoles(
         return Driven(field, None)
     along = dipole_field_along(offset, moment, along_beacon[..., None, :])
     return Driven(field, np.sum(along, axis=-2))
-
-
-def _of_matrices(of_points: Array) -> Array:
-    """Return the array of each beacon's coils without the axis of its points."""
-    return of_points[..., 0, :, :] if of_points.ndim > 2 else of_points

@@ -24,18 +24,10 @@ class Component(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlation coefficients of the errors behind a site's sigmas.
+    """Correlation coefficients of the errors behind a site's sigmas."""
 
-    Parameters
-    ----------
-    parameters : tuple of Component
-        All others are independent.
-    coefficients : ndarray, shape (n, n)
-        With unit diagonal.
-    """
-
-    parameters: tuple[Component, ...]
-    coefficients: Array
+    parameters: tuple[Component, ...]  # all others are independent
+    coefficients: Array  # (n, n), with unit diagonal
 
     def kept(self, wanted: Callable[[Component], bool]) -> "Correlation | None":
         """Return the part between some parameters; None if it is empty."""

@@ -23,17 +23,10 @@ NEAREST = 0.1  # m; smallest distance for a predicted field
 
 
 class Tones(NamedTuple):
-    """Distinct transmitted frequencies.
+    """Distinct transmitted frequencies."""
 
-    Parameters
-    ----------
-    frequencies_hz : ndarray, shape (tones,)
-        In the order of the channels.
-    of_channel : int ndarray, shape (channels of a magnetometer,)
-    """
-
-    frequencies_hz: Array
-    of_channel: IntArray
+    frequencies_hz: Array  # (tones,), in the order of the channels
+    of_channel: IntArray  # (channels of a magnetometer,)
 
     @property
     def reused(self) -> bool:
@@ -83,12 +76,8 @@ def phasor_sigma(site: Site, window: float) -> float:
 def largest_fields(site: Site, sensor_world: Array, margin: Array | float = 0.0) -> Array:
     """Return the upper limit of each phasor of a magnetometer, shape (n, channels) (T).
 
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, 3)
-        (m)
-    margin : ndarray, shape (n, 1), or float
-        Reduction of the distance to the beacons (m); negative for an increase.
+    `sensor_world` (n, 3) (m). `margin` (n, 1), or float: reduction of the distance to the beacons
+    (m); negative for an increase.
     """
     places = np.array([beacon.position_world for beacon in site.beacons])
     owner = [i for i, beacon in enumerate(site.beacons) for _ in beacon.tones]
@@ -106,17 +95,11 @@ def mutually_undetectable(a: Beacon, b: Beacon, sigma: float) -> bool:
 
 
 class Owned(NamedTuple):
-    """Owners of the phasors of each tone.
+    """Owners of the phasors of each tone."""
 
-    Parameters
-    ----------
-    channels : bool ndarray, shape (n, channels)
-        Channels of the strongest beacon on each frequency, if it dominates the others.
-    others : ndarray, shape (n, channels)
-        Largest contribution of the others on the frequency to its phasor (T).
-    """
-
+    # (n, channels), channels of the strongest beacon on each frequency, if it dominates the others
     channels: BoolArray
+    # (n, channels), largest contribution of the others on the frequency to its phasor (T)
     others: Array
 
 
@@ -125,15 +108,9 @@ def owned_at(
 ) -> Owned:
     """Return the owners of the phasors of a magnetometer at its positions.
 
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, 3)
-        (m)
-    margin : ndarray, shape (n, 1), or float
-        Error of the positions (m).
-    unknown : ndarray, shape (n, channels), or float
-        Share of each beacon's field that is not predicted, after a prediction has been
-        subtracted; undetected beacons last.
+    `sensor_world` (n, 3) (m). `margin` (n, 1), or float: error of the positions (m).
+    `unknown` (n, channels), or float: share of each beacon's field that is not predicted, after a
+    prediction has been subtracted; undetected beacons last.
     """
     count = len(site.tone_frequencies_hz)
     site = replace(site, beacons=(*site.beacons, *(b for _, b in site.undetected)), undetected=())

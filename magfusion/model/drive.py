@@ -13,24 +13,17 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, ComplexArray
 
-MAX_READINGS = 1000  # readings of each channel that a running estimator keeps
+MAX_READINGS = 1000  # readings of each channel, or part, that a running estimator keeps
 LEAST_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
 LEAST_ON = 0.05  # of the declared current; below, the drive is off and has no phase
 
 
 @dataclass(frozen=True, eq=False)
 class DriveSamples:
-    """Sampled currents.
+    """Sampled currents."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, strictly increasing.
-    current : mapping of str to ndarray, shape (n,)
-        Current of each beacon, by its name (A); ``""`` for all that have none of their own.
-    """
-
-    time: Array
+    time: Array  # (n,), seconds since the log's epoch, strictly increasing
+    # (n,) each, current of each beacon, by its name (A); ``""`` for all that have none of their own
     current: Mapping[str, Array]
 
     def rows(self, kept: slice | BoolArray) -> "DriveSamples":
@@ -42,11 +35,8 @@ class DriveSamples:
 class DriveShares:
     """Readings of several channels, complete or streamed.
 
-    Parameters
-    ----------
-    readings : mapping, optional
-        By channel, as of `key`, shape (3, n): times, increasing (s), logarithms of the ratios'
-        magnitudes, and their angles, unwrapped (rad).
+    `readings`: by channel, as of `key`, shape (3, n): times, increasing (s), logarithms of the
+    ratios' magnitudes, and their angles, unwrapped (rad).
     """
 
     readings: dict[str, Array]  # part of a checkpoint

@@ -22,31 +22,15 @@ PULSE = 0.01  # s; of each whole second, short for outputs without a steady volt
 
 @dataclass(frozen=True)
 class DriveChannel:
-    """Signal of one coil, ``level cos(2 pi f t + phase)`` in its time slot.
-
-    Parameters
-    ----------
-    beacon : str
-    coil : int
-        Of the beacon, counted from 0.
-    frequency_hz : float
-    phase : float
-        (rad)
-    level : float
-        Amplitude relative to full scale.
-    slots : Slots, optional
-        Schedule of the coil if it is driven in turn.
-    slot : int, optional
-        Its slot.
-    """
+    """Signal of one coil, ``level cos(2 pi f t + phase)`` in its time slot."""
 
     beacon: str
-    coil: int
+    coil: int  # of the beacon, counted from 0
     frequency_hz: float
-    phase: float
-    level: float
-    slots: Slots | None = None
-    slot: int | None = None
+    phase: float  # (rad)
+    level: float  # amplitude relative to full scale
+    slots: Slots | None = None  # schedule of the coil if it is driven in turn
+    slot: int | None = None  # its slot
 
     def samples(self, time: Array) -> Array:
         """Return the signal at times (s), shape (n,)."""
@@ -59,16 +43,9 @@ class DriveChannel:
 def drive_channels(site: Site, rate_hz: float, level: float) -> tuple[DriveChannel, ...]:
     """Return a channel for each coil of a site, in its order.
 
-    Parameters
-    ----------
-    level : float
-        Amplitude of the strongest relative to full scale.  Others are lower in proportion to their
-        currents if all are declared, else to their moments: as of equal coils.
-
-    Raises
-    ------
-    InputError
-        Where a sound card cannot play what drives a coil.
+    `level`: amplitude of the strongest relative to full scale. Others are lower in proportion to
+    their currents if all are declared, else to their moments: as of equal coils. Raises InputError
+    where a sound card cannot play what drives a coil.
     """
     for beacon in site.beacons:
         _check(beacon, rate_hz)
@@ -134,17 +111,9 @@ def drive_samples(
 ) -> Array:
     """Return what a file has that repeats without a step, shape (n, channels) or one column more.
 
-    Parameters
-    ----------
-    duration : float
-        Longest length (s); the length is the largest multiple of the common period within it.
-    pulses : bool
-        Whether a last column has a pulse that rises at each whole second.
-
-    Raises
-    ------
-    InputError
-        Where the channels do not repeat within the duration.
+    `duration`: longest length (s); the length is the largest multiple of the common period within
+    it. `pulses`: whether a last column has a pulse that rises at each whole second. Raises
+    InputError where the channels do not repeat within the duration.
     """
     period = common_period(channels, rate_hz, pulses)
     if period > duration:

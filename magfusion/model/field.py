@@ -292,17 +292,10 @@ def driven_field(
 ) -> Driven:
     """Return the field of a beacon at points for given coil currents, world axes.
 
-    Parameters
-    ----------
-    beacon : Beacon or Sources
-        As of `observe`.
-    position_world : ndarray, shape (n, 3)
-        (m)
-    current : ndarray, shape (n, coils) or (beacons, n, coils)
-        Of each coil, as a share of its peak; complex and rotating with time in conducting
-        ground: the result is then the real part.
-    along_world : ndarray, shape (n, 3), optional
-        A displacement of the points, or their velocity.
+    `beacon`: as of `observe`. `position_world` (n, 3) (m). `current` (n, coils) or
+    (beacons, n, coils): of each coil, as a share of its peak; complex and rotating with time in
+    conducting ground: the result is then the real part. `along_world` (n, 3): a displacement of the
+    points, or their velocity.
     """
     source = _source(beacon)
     world_from_beacon = source.world_from_beacon
@@ -332,30 +325,14 @@ def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Arra
 
 
 class EarthObservation(NamedTuple):
-    """Predicted steady field with its Jacobian blocks, named by the variable of each.
+    """Predicted steady field with its Jacobian blocks, named by the variable of each."""
 
-    Parameters
-    ----------
-    measured_sensor : ndarray, shape (..., 3)
-        (T), measured axes.
-    platform_rotation : ndarray, shape (..., 3, 3)
-        Right perturbation of world_from_body (T/rad).
-    matrix : ndarray, shape (..., 3, 9)
-        Magnetometer matrix, row by row (T).
-    sensor_rotation : ndarray, shape (..., 3, 3)
-        Right perturbation of body_from_sensor (T/rad).
-    offset : ndarray, shape (..., 3, 3)
-        Of the magnetometer.
-    earth_world : ndarray, shape (..., 3, 3)
-        Steady field, world axes.
-    """
-
-    measured_sensor: Array
-    platform_rotation: Array
-    matrix: Array
-    sensor_rotation: Array
-    offset: Array
-    earth_world: Array
+    measured_sensor: Array  # (..., 3) (T), measured axes
+    platform_rotation: Array  # (..., 3, 3), right perturbation of world_from_body (T/rad)
+    matrix: Array  # (..., 3, 9), magnetometer matrix, row by row (T)
+    sensor_rotation: Array  # (..., 3, 3), right perturbation of body_from_sensor (T/rad)
+    offset: Array  # (..., 3, 3), of the magnetometer
+    earth_world: Array  # (..., 3, 3), steady field, world axes
 
 
 def observe_earth(
@@ -367,11 +344,7 @@ def observe_earth(
 
         m = S sensor_from_body body_from_world e + offset
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (..., 3, 3)
-    earth_field_world : ndarray, shape (3,)
-        (T)
+    `world_from_body` (..., 3, 3), `earth_field_world` (3,) (T).
     """
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
     measured_from_body = matrix @ mounting.T

@@ -18,31 +18,17 @@ _ROWS = 8192  # positions evaluated at once
 
 @dataclass(frozen=True, eq=False)
 class FieldMap:
-    """A Gaussian process with a squared-exponential kernel, conditioned on a survey.
+    """A Gaussian process with a squared-exponential kernel, conditioned on a survey."""
 
-    Parameters
-    ----------
-    points_world : ndarray, shape (m, 3)
-        Of the sensor (m).
-    weights : ndarray, shape (m, 4)
-        The mean at x is ``sigma^2 sum_j rho(x, x_j) weights_j``.
-    information : ndarray, shape (m, 4, 4)
-        Information of the survey on gain and rotation at each point.
-    length_scale : float
-        (m)
-    gain_sigma, rotation_sigma : float
-        Of the process, far from surveyed points; the latter in rad.
-    residual : float
-        Relative error of the field not explained by a smooth map, one sigma; it replaces the
-        site's ``model_error``.
-    """
-
-    points_world: Array
-    weights: Array
-    information: Array
-    length_scale: float
+    points_world: Array  # (m, 3), of the sensor (m)
+    weights: Array  # (m, 4), the mean at x is ``sigma^2 sum_j rho(x, x_j) weights_j``
+    information: Array  # (m, 4, 4), information of the survey on gain and rotation at each point
+    length_scale: float  # (m)
+    # gain_sigma, rotation_sigma: of the process, far from surveyed points; the latter in rad
     gain_sigma: float
     rotation_sigma: float
+    # relative error of the field not explained by a smooth map, one sigma; it replaces the site's
+    # ``model_error``
     residual: float
 
     @cached_property
@@ -68,17 +54,9 @@ class FieldMap:
     def mean(self, position_world: Array) -> tuple[Array, Array]:
         """Return the map and its gradient.
 
-        Parameters
-        ----------
-        position_world : ndarray, shape (..., 3)
-            Of the sensor (m).
-
-        Returns
-        -------
-        value : ndarray, shape (..., 4)
-            Log-gain and rotation (rad, world axes).
-        gradient : ndarray, shape (..., 4, 3)
-            With respect to the position, world axes (1/m).
+        `position_world` (..., 3): of the sensor (m). Returns `value` (..., 4): log-gain and
+        rotation (rad, world axes); `gradient` (..., 4, 3): with respect to the position, world axes
+        (1/m).
         """
         flat = position_world.reshape(-1, 3)
         value, gradient = np.empty((len(flat), 4)), np.empty((len(flat), 4, 3))
@@ -110,14 +88,8 @@ class FieldMap:
     def relative_variance(self, position_world: Array | None = None) -> Array:
         """Return the mean square of the field's error relative to its strength.
 
-        Parameters
-        ----------
-        position_world : ndarray, shape (n, 3), optional
-            Of the sensor (m); None for a typical surveyed position.
-
-        Returns
-        -------
-        ndarray, shape (n,) or ()
+        `position_world` (n, 3): of the sensor (m); None for a typical surveyed position. Returns
+        (n,) or ().
         """
         known = self.typical_variance if position_world is None else self.variance(position_world)
         # A rotation changes the field by its two components across the field.

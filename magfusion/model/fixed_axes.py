@@ -12,15 +12,7 @@ def fixed_axes_covariance(world_from_body: Array, pose_cov: Array) -> Array:
     That of ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z
     axes of the header's frame, which do not move the position.  To first order both parts rotate to
     the world: ``d_position_world = R d_position_body`` and ``R exp(d) = exp(R d) R``.
-
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (..., 3, 3)
-    pose_cov : ndarray, shape (..., 6, 6)
-
-    Returns
-    -------
-    ndarray, shape (..., 6, 6)
+    `world_from_body` (..., 3, 3), `pose_cov` (..., 6, 6). Returns (..., 6, 6).
     """
     jacobian = np.zeros_like(pose_cov)
     jacobian[..., :3, 3:] = jacobian[..., 3:, :3] = world_from_body

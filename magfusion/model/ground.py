@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.model.coil_field import alone, coil_fields
 from magfusion.model.physics.conduction import skin_depth
 from magfusion.model.site import Beacon, Site
-from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
+from magfusion.units import MU0_OVER_4PI, TINY, Array, ComplexArray
 
 # Beyond so many skin depths about a hundredth of the field remains, which depends more on the
 # ground than on the position.
@@ -15,7 +15,6 @@ DEEPEST = 5.0
 
 _NEARER = 3.0  # e-folds by which conduction may reduce the range
 _HALVINGS = 24
-_TINY = 1e-300
 
 
 def conductivity_of(site: Site) -> float:
@@ -38,15 +37,8 @@ def skin_depth_count(beacon: Beacon, distance: Array) -> Array:
 def ground_error(site: Site, distance: Array) -> Array:
     """Return the relative error of each beacon's field that the conductivity's sigma causes.
 
-    Parameters
-    ----------
-    distance : ndarray, shape (n, beacons)
-        (m)
-
-    Returns
-    -------
-    ndarray, shape (n, beacons)
-        Of the field in the dipole's equatorial plane.
+    `distance` (n, beacons) (m). Returns (n, beacons): of the field in the dipole's equatorial
+    plane.
     """
     depths = [skin_depth_count(b, distance[:, k]) for k, b in enumerate(site.beacons)]
     x = (1.0 + 1.0j) * np.minimum(np.stack(depths, axis=1), 2.0 * DEEPEST)
@@ -56,19 +48,10 @@ def ground_error(site: Site, distance: Array) -> Array:
 def range_of_strength(beacon: Beacon, phasor: ComplexArray, direction_beacon: Array) -> Array:
     """Return the range in each direction at which a beacon's field is as strong as its phasors.
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, tones, 3)
-        (T), in any axes.
-    direction_beacon : ndarray, shape (directions, 3)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray, shape (n, directions)
-        (m)
+    `phasor` (n, tones, 3) (T), in any axes. `direction_beacon` (directions, 3): unit vectors.
+    Returns (n, directions) (m).
     """
-    total = np.sum(np.abs(phasor) ** 2, axis=(1, 2))[:, None] + _TINY
+    total = np.sum(np.abs(phasor) ** 2, axis=(1, 2))[:, None] + TINY
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     strongest = 2.0 * MU0_OVER_4PI * np.sqrt(np.sum(np.abs(drive) ** 2))
     # With conduction the field is nowhere stronger than that of the dipole at its poles.

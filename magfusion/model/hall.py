@@ -11,18 +11,10 @@ ON_THE_LINE = 1e-6  # m; distance from an edge
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """Volume over a polygon, between two heights.
+    """Volume over a polygon, between two heights."""
 
-    Parameters
-    ----------
-    polygon : ndarray, shape (k, 2)
-        Corners in order, world x and y (m).
-    heights : ndarray, shape (2,)
-        Lowest and highest (m).
-    """
-
-    polygon: Array
-    heights: Array
+    polygon: Array  # (k, 2), corners in order, world x and y (m)
+    heights: Array  # (2,), lowest and highest (m)
 
     @property
     def box_world(self) -> Array:
@@ -72,51 +64,29 @@ def prism_of(box_world: Array) -> Prism:
 
 @dataclass(frozen=True, eq=False)
 class Mounts:
-    """Mounting places for beacons in a hall.
+    """Mounting places for beacons in a hall."""
 
-    Parameters
-    ----------
-    walls : tuple of int
-        Edges of the hall's polygon, counted from 0.
-    heights : ndarray, shape (2,)
-        Heights of mounting on walls (m).
-    ceiling, floor : bool
-    forbidden : tuple of Prism
-        Volumes without mounting places.
-    """
-
-    walls: tuple[int, ...]
-    heights: Array
+    walls: tuple[int, ...]  # edges of the hall's polygon, counted from 0
+    heights: Array  # (2,), heights of mounting on walls (m)
     ceiling: bool = False
     floor: bool = False
-    forbidden: tuple[Prism, ...] = ()
+    forbidden: tuple[Prism, ...] = ()  # volumes without mounting places
 
 
 @dataclass(frozen=True, eq=False)
 class Hall:
-    """A hall and the volume to navigate in.
-
-    Parameters
-    ----------
-    use : Prism
-        Volume to navigate in.
-    margin : float
-        Distance from the walls that is not used (m).
-    """
+    """A hall and the volume to navigate in."""
 
     room: Prism
     mounts: Mounts
-    use: Prism
-    margin: float = 0.0
+    use: Prism  # volume to navigate in
+    margin: float = 0.0  # distance from the walls that is not used (m)
 
 
 def points_of_use(hall: Hall, spacing: float) -> Array:
     """Return grid points in the volume to navigate in, shape (n, 3) (m).
 
-    Parameters
-    ----------
-    spacing : float
-        Largest distance of neighbours along an axis (m).
+    `spacing`: largest distance of neighbours along an axis (m).
     """
     low, high = hall.use.box_world
     inside = np.array([hall.margin, hall.margin, 0.0])

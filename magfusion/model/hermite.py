@@ -12,19 +12,8 @@ from magfusion.units import Array
 def hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Array, Array]:
     """Return values and slopes of the interpolating cubics at some times.
 
-    Beyond the ends the last cubics are extrapolated.
-
-    Parameters
-    ----------
-    known : ndarray, shape (n,)
-        Strictly increasing (s).
-    value, slope : ndarray, shape (n, k)
-    wanted : ndarray, shape (m,)
-        (s)
-
-    Returns
-    -------
-    tuple of ndarray, shape (m, k)
+    Beyond the ends the last cubics are extrapolated. `known` (n,): strictly increasing (s).
+    `value`, `slope` (n, k), `wanted` (m,) (s). Returns (m, k) each.
     """
     index = known.searchsorted(wanted, side="right") - 1
     index = np.minimum(np.maximum(index, 0), len(known) - 2)  # faster than clip for few

@@ -13,17 +13,12 @@ class ImuIntrinsics:
 
     ``measured gyro = gyro_matrix @ rate + gyro_g_sensitivity @ force + bias`` and
     ``measured accel = accel_matrix @ force + bias``, in body axes.
-
-    Parameters
-    ----------
-    gyro_matrix, accel_matrix : ndarray, shape (3, 3)
-        Scale factors and directions of the axes.
-    gyro_g_sensitivity : ndarray, shape (3, 3)
-        Rate (rad/s) that each m/s^2 of specific force causes.
     """
 
+    # gyro_matrix, accel_matrix: (3, 3), scale factors and directions of the axes
     gyro_matrix: Array = field(default_factory=lambda: np.eye(3))
     accel_matrix: Array = field(default_factory=lambda: np.eye(3))
+    # (3, 3), rate (rad/s) that each m/s^2 of specific force causes
     gyro_g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def corrected(self, gyro_body: Array, accel_body: Array) -> tuple[Array, Array]:

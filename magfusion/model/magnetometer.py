@@ -11,96 +11,51 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerSigma:
-    """Prior standard deviations of the magnetometer's calibration; zero means known.
+    """Prior standard deviations of the magnetometer's calibration; zero means known."""
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (3, 3)
-    offset : ndarray, shape (3,)
-        (T)
-    rotation_sensor : ndarray, shape (3,)
-        Of the mounting, sensor axes (rad).
-    position_body : ndarray, shape (3,)
-        Of the lever arm, body axes (m).
-    clock_offset : float
-        (s)
-    """
-
-    matrix: Array
-    offset: Array
-    rotation_sensor: Array
-    position_body: Array
-    clock_offset: float = 0.0
+    matrix: Array  # (3, 3)
+    offset: Array  # (3,) (T)
+    rotation_sensor: Array  # (3,), of the mounting, sensor axes (rad)
+    position_body: Array  # (3,), of the lever arm, body axes (m)
+    clock_offset: float = 0.0  # (s)
 
 
 @dataclass(frozen=True, eq=False)
 class Magnetometer:
-    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform.
-
-    Parameters
-    ----------
-    position_body : ndarray, shape (3,)
-        Lever arm (m).
-    body_from_sensor : ndarray, shape (3, 3)
-        Mounting rotation.
-    noise_density : float
-        One-sided white noise (T/sqrt(Hz)).
-    matrix : ndarray, shape (3, 3)
-    offset : ndarray, shape (3,)
-        (T)
-    coil_centres_sensor : ndarray, shape (3, 3), optional
-        Magnetic centre of each axis's own coil (m), row by row; None where all three are at
-        ``position_body``.
-    offset_walk : float
-        Standard deviation that the offset gains in an hour (T).
-    coil_kappa : float
-        Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
-    temperature_model : SensorTemperatureModel, optional
-        Temperature dependence of matrix and offset.
-    response : FrequencyResponse or AxisResponses, optional
-        Response to alternating fields; None if equal to that of steady fields.
-    response_sigma : ResponseSigma, optional
-        Prior of the responses of y and z relative to x; None if known.
-    axes : str
-        Names of its axes.
-    casing : Casing, optional
-        Steel tube around it.
-    name : str
-        Identifies it in data and reports where there are several.
-    clock_offset : float
-        A sample stamped t was taken at t + clock_offset on the log's clock (s).
-    clock_rate : float
-        Of a single magnetometer: a sample stamped t was taken at t (1 + clock_rate) on the clock
-        of the drives.
-    clock_rate_sigma : float
-        Prior standard deviation of ``clock_rate``.
-    field_range : float
-        Largest value of each axis in size (T); by default a hundred times a fluxgate's.
-    ac_coupled : bool
-        Whether it measures alternating fields alone: no steady field, and nothing of it.
-    """
+    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform."""
 
     __repr__ = short_repr
 
-    position_body: Array
-    body_from_sensor: Array
-    noise_density: float
-    matrix: Array
-    offset: Array
+    position_body: Array  # (3,), lever arm (m)
+    body_from_sensor: Array  # (3, 3), mounting rotation
+    noise_density: float  # one-sided white noise (T/sqrt(Hz))
+    matrix: Array  # (3, 3)
+    offset: Array  # (3,) (T)
     sigma: MagnetometerSigma
+    # (3, 3), magnetic centre of each axis's own coil (m), row by row; None where all three are at
+    # ``position_body``
     coil_centres_sensor: Array | None = None
-    offset_walk: float = 2e-8
+    offset_walk: float = 2e-8  # standard deviation that the offset gains in an hour (T)
+    # finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point
     coil_kappa: float = 0.0
+    # temperature dependence of matrix and offset
     temperature_model: SensorTemperatureModel | None = None
+    # response to alternating fields; None if equal to that of steady fields
     response: FrequencyResponse | AxisResponses | None = None
+    # prior of the responses of y and z relative to x; None if known
     response_sigma: ResponseSigma | None = None
-    axes: str = "xyz"
-    casing: Casing | None = None
-    name: str = "magnetometer"
+    axes: str = "xyz"  # names of its axes
+    casing: Casing | None = None  # steel tube around it
+    name: str = "magnetometer"  # identifies it in data and reports where there are several
+    # a sample stamped t was taken at t + clock_offset on the log's clock (s)
     clock_offset: float = 0.0
+    # of a single magnetometer: a sample stamped t was taken at t (1 + clock_rate) on the clock of
+    # the drives
     clock_rate: float = 0.0
-    clock_rate_sigma: float = 0.0
+    clock_rate_sigma: float = 0.0  # prior standard deviation of ``clock_rate``
+    # largest value of each axis in size (T); by default a hundred times a fluxgate's
     field_range: float = 0.1
+    # whether it measures alternating fields alone: no steady field, and nothing of it
     ac_coupled: bool = False
 
     @property

@@ -12,19 +12,12 @@ UNKNOWN_SLOT = -2  # slot of samples to ignore, while the current settles
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Bursts in order of time, without overlap.
+    """Bursts in order of time, without overlap."""
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (n,)
-        On the clock of the waveform, seconds since the log's epoch.
-    slot : int ndarray, shape (n,)
-        Slot of the driven coils; `SILENT` for none.
-    """
-
+    # begin, end: (n,), on the clock of the waveform, seconds since the log's epoch
     begin: Array
     end: Array
-    slot: IntArray
+    slot: IntArray  # (n,), slot of the driven coils; `SILENT` for none
 
     def __len__(self) -> int:
         return len(self.slot)
@@ -75,10 +68,7 @@ class SlotColumn:
     def add_samples(self, time: Array, slot: IntArray) -> Marks:
         """Return the bursts completed by samples; samples not later than earlier ones are skipped.
 
-        Parameters
-        ----------
-        slot : int ndarray, shape (n,)
-            Of each sample; `UNKNOWN_SLOT` for samples to ignore.
+        `slot` (n,): of each sample; `UNKNOWN_SLOT` for samples to ignore.
         """
         newest = np.maximum.accumulate(np.append(self._last, time))
         later = time > newest[:-1]

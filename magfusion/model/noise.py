@@ -22,17 +22,8 @@ ROUNDING = 1e-12  # of a covariance's mean eigenvalue
 def calibration_error(site: Site, distance: Array, sensor: int = 0) -> Array:
     """Return the relative error of each beacon's field that its survey's sigmas cause.
 
-    Parameters
-    ----------
-    distance : ndarray, shape (n, beacons)
-        (m)
-    sensor : int
-        Index of the magnetometer.
-
-    Returns
-    -------
-    ndarray, shape (n, beacons)
-        To first order: the field falls with the cube of the distance.
+    `distance` (n, beacons) (m). `sensor`: index of the magnetometer. Returns (n, beacons): to first
+    order: the field falls with the cube of the distance.
     """
     variance = np.zeros_like(distance)
     names = [beacon.name for beacon in site.beacons]
@@ -63,14 +54,10 @@ def _distances(site: Site, square: Array) -> Array:
 def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None) -> Array:
     """Return the squared amplitude of each component, shape (n, channels, 3) (T^2).
 
-    Where a channel lacks components, all three are the mean of the model field at the position:
-    the model error does not vanish with the component along a coil.  Without a position they are
-    the mean of the available components.
-
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Their positions (m).  With several magnetometers each has all three components.
+    Where a channel lacks components, all three are the mean of the model field at the position: the
+    model error does not vanish with the component along a coil.  Without a position they are the
+    mean of the available components. `sensor_world` (n, magnetometers, 3): their positions (m).
+    With several magnetometers each has all three components.
     """
     square, partial = np.abs(samples.phasor_sensor) ** 2, samples.partial
     if not np.any(partial):
@@ -97,14 +84,8 @@ def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None
 def model_error(site: Site, sensor_world: Array | None = None) -> Array:
     """Return the relative error of the field model in each channel, one sigma.
 
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Their positions (m): the uncertainty of a field map depends on position.
-
-    Returns
-    -------
-    ndarray, shape (channels,) or (n, channels)
+    `sensor_world` (n, magnetometers, 3): their positions (m): the uncertainty of a field map
+    depends on position. Returns (channels,) or (n, channels).
     """
     if site.platform.further:
         places = [None] if sensor_world is None else np.swapaxes(sensor_world, 0, 1)
@@ -155,13 +136,8 @@ def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Arr
 def magnetometers_sharing_error(site: Site, valid: BoolArray) -> Array:
     """Return how many magnetometers of an epoch share a field-model error, (n, channels).
 
-    The error is caused by iron and correlated over its length scale, so that several
-    magnetometers within it do not average it.
-
-    Parameters
-    ----------
-    valid : bool ndarray, shape (n, channels)
-        Available channels of the epochs.
+    The error is caused by iron and correlated over its length scale, so that several magnetometers
+    within it do not average it. `valid` (n, channels): available channels of the epochs.
     """
     places = np.array([sensor.position_body for sensor in site.platform.magnetometers])
     if len(places) == 1 or site.model_error_length <= 0.0:
@@ -184,23 +160,11 @@ def measurement_cov(
     """Return the covariance of each phasor component: noise and model error.
 
     Errors shared by several epochs do not average over them: each epoch gets a part of the weight.
-
-    Parameters
-    ----------
-    survey_error : bool
-        Add the effect of the calibration sigmas, for a solver that does not estimate them.
-    sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Their approximate positions (m), for the uncertainty of a field map.
-    shared_by : ndarray, shape (n,), or float
-        Number of epochs that share a model error.
-    neighbours : bool
-        Whether magnetometers next to each other count as one for their shared error; not where
-        the estimate considers it.
-
-    Returns
-    -------
-    ndarray, shape (n, channels, 3, 3)
-        (T^2), measured axes.
+    `survey_error`: add the effect of the calibration sigmas, for a solver that does not estimate
+    them. `sensor_world` (n, magnetometers, 3): their approximate positions (m), for the uncertainty
+    of a field map. `shared_by` (n,), or float: number of epochs that share a model error.
+    `neighbours`: whether magnetometers next to each other count as one for their shared error; not
+    where the estimate considers it. Returns (n, channels, 3, 3) (T^2), measured axes.
     """
     ways = ((1.0, shared_by),)
     (total,), square, power = _covs(site, samples, sensor_world, ways, neighbours=neighbours)
@@ -221,10 +185,7 @@ def weighed_and_alone(
 ) -> tuple[Array, Array]:
     """Return `measurement_cov` of epochs with shared noise and model error, and as independent.
 
-    Parameters
-    ----------
-    `sensor_world`, `windows`, `shared_by`, `neighbours`
-        As of `measurement_cov`.
+    ``sensor_world``, ``windows``, ``shared_by``, ``neighbours``: as of `measurement_cov`.
     """
     ways = (windows, shared_by), (1.0, 1.0)
     (weighed, alone), _, _ = _covs(site, samples, sensor_world, ways, neighbours=neighbours)
@@ -284,12 +245,8 @@ def cholesky(cov: Array) -> Array:
 def whitening(cov: Array, there: BoolArray) -> Array:
     """Return ``W`` with ``W^T W = cov^-1``, shape (..., 3, 3); zero where a component is missing.
 
-    Parameters
-    ----------
-    cov : ndarray, shape (..., 3, 3)
-    there : bool ndarray, shape (..., 3) or (...)
-        Of each component, or of all three.  The covariance of the available components is
-        inverted, independent of the noise of missing ones.
+    `cov` (..., 3, 3). `there` (..., 3) or (...): of each component, or of all three. The covariance
+    of the available components is inverted, independent of the noise of missing ones.
     """
     each = there.ndim == cov.ndim - 1
     if there.all():
@@ -328,18 +285,8 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> 
 
     ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: with weights for
     white noise alone the nearest beacon's model error dominates (paper 004 re-examined).
-
-    Parameters
-    ----------
-    phasor_sensor : complex ndarray, shape (..., 3)
-        (T)
-    model_error : float or ndarray, shape (...)
-        Relative error of the field model, one sigma.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        (T^2)
+    `phasor_sensor` (..., 3) (T). `model_error` scalar or (...): relative error of the field model,
+    one sigma. Returns (..., 3, 3) (T^2).
     """
     return power_error_cov(0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1), model_error)
 

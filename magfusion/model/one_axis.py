@@ -66,14 +66,9 @@ def opened_state(
 ) -> Array:
     """Add any roll about the coil to the covariance of a state's tangent.
 
-    Parameters
-    ----------
-    cov : ndarray, shape (k, k)
-        Pose (body axes), velocity (world), accelerometer and gyro bias, calibration.
-    gyro_bias_body : ndarray, shape (3,)
-        Negative rate of a motion prior (rad/s).
-    rate_sigma : float
-        Of the rate about the coil (rad/s).
+    `cov` (k, k): pose (body axes), velocity (world), accelerometer and gyro bias, calibration.
+    `gyro_bias_body` (3,): negative rate of a motion prior (rad/s). `rate_sigma`: of the rate about
+    the coil (rad/s).
     """
     sensor = site.platform.magnetometer
     axis, lever = axis_of(sensor), coil_lever(sensor)

@@ -24,11 +24,7 @@ def field_along_path(
     """Return the field of a source at points of a path, as `driven_field`.
 
     With a map of field or steel, or where points are too far apart, they are evaluated one by one.
-
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        In the order of the path (m).
+    `position_world` (n, 3): in the order of the path (m).
     """
     if source.is_mapped or len(position_world) < MIN_POINTS:
         return driven_field(source, position_world, current, along_world)

@@ -5,37 +5,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Motion of the platform, and its rest thresholds; the defaults suit a hand.
+    """Motion of the platform, and its rest thresholds; the defaults suit a hand."""
 
-    Parameters
-    ----------
-    rest_gyro, rest_accel : float
-        At rest, rate (rad/s) and specific force (m/s^2) deviate by less from their means.
-    rest_span : float
-        Minimum duration of rest (s).
-    rest_speed_sigma : float
-        Of the zero-velocity update (m/s).
-    rest_known_speed : float
-        A velocity with a larger sigma is not set to zero (m/s).
-    speed_sigma : float
-        Usual speed (m/s).
-    accel_sigma : float
-        Of the mean specific force against gravity, in motion (m/s^2).
-    accel_span : float
-        Averaging time of the specific force (s).
-    start_speed_sigma : float
-        Prior of the first velocity (m/s).
-    """
-
+    # rest_gyro, rest_accel: at rest, rate (rad/s) and specific force (m/s^2) deviate by less from
+    # their means
     rest_gyro: float = 0.03
     rest_accel: float = 0.25
-    rest_span: float = 1.0
-    rest_speed_sigma: float = 0.01
-    rest_known_speed: float = 0.1
-    speed_sigma: float = 1.0
-    accel_sigma: float = 1.5
-    accel_span: float = 2.0
-    start_speed_sigma: float = 10.0
+    rest_span: float = 1.0  # minimum duration of rest (s)
+    rest_speed_sigma: float = 0.01  # of the zero-velocity update (m/s)
+    rest_known_speed: float = 0.1  # a velocity with a larger sigma is not set to zero (m/s)
+    speed_sigma: float = 1.0  # usual speed (m/s)
+    accel_sigma: float = 1.5  # of the mean specific force against gravity, in motion (m/s^2)
+    accel_span: float = 2.0  # averaging time of the specific force (s)
+    start_speed_sigma: float = 10.0  # prior of the first velocity (m/s)
 
 
 A_HAND = MotionModel()
@@ -69,14 +51,9 @@ class HeldModel(ImuModel):
     """Model of a motion prior without rotation about an axis, in place of an IMU.
 
     For a receiver of one axis, whose roll about its coil is unobservable.
-
-    Parameters
-    ----------
-    held_axis : tuple of float
-        Unit vector in body axes.
     """
 
-    held_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    held_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit vector in body axes
 
 
 # Default of a site that declares none: nothing is known from it.
@@ -94,21 +71,13 @@ NO_IMU = ImuModel(
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """Motion assumed where no IMU measures it: white accelerations.
+    """Motion assumed where no IMU measures it: white accelerations."""
 
-    Parameters
-    ----------
-    accel_density : float
-        Of the acceleration, each axis (m/s^2/sqrt(Hz)); velocity is its random walk.
-    angular_accel_density : float
-        Of the angular acceleration, each axis (rad/s^2/sqrt(Hz)); the rate is its random walk.
-    rate_sigma : float
-        Of the initial rate (rad/s).
-    """
-
+    # of the acceleration, each axis (m/s^2/sqrt(Hz)); velocity is its random walk
     accel_density: float = 2.0
+    # of the angular acceleration, each axis (rad/s^2/sqrt(Hz)); the rate is its random walk
     angular_accel_density: float = 3.0
-    rate_sigma: float = 3.0
+    rate_sigma: float = 3.0  # of the initial rate (rad/s)
 
 
 @dataclass(frozen=True)

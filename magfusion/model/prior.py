@@ -20,17 +20,8 @@ def parameters_of(blocks: tuple[Block, ...]) -> list[Component]:
 def prior_sqrt_covariance(site: Site, blocks: tuple[Block, ...]) -> Array:
     """Return the triangular matrix that transforms unit noise to a sample of the prior.
 
-    Parameters
-    ----------
-    site : Site
-        The declared one, with its correlation.
-    blocks : tuple of Block
-        Parameters not among them are marginalised.
-
-    Returns
-    -------
-    ndarray, shape (dimension, dimension)
-        ``spread @ spread.T`` is the prior's covariance.
+    `site`: the declared one, with its correlation. `blocks`: parameters not among them are
+    marginalised. Returns (dimension, dimension): ``spread @ spread.T`` is the prior's covariance.
     """
     sigma = prior_sigma(blocks)
     if site.correlation is None:

@@ -7,23 +7,12 @@ from magfusion.units import Array, IntArray
 
 @dataclass(frozen=True, eq=False)
 class ProbeReadings:
-    """Readings of a one-axis probe; a three-axis probe gives three readings.
+    """Readings of a one-axis probe; a three-axis probe gives three readings."""
 
-    Parameters
-    ----------
-    coil : ndarray of int, shape (n,)
-        Driven coil, from 0.
-    position : ndarray, shape (n, 3)
-        Of the probe, antenna axes (m).
-    axis : ndarray, shape (n, 3)
-        Measured direction, unit vectors, antenna axes.
-    reading, sigma : ndarray, shape (n,)
-        Signed amplitude, and its standard deviation (T).
-    """
-
-    coil: IntArray
-    position: Array
-    axis: Array
+    coil: IntArray  # (n,), driven coil, from 0
+    position: Array  # (n, 3), of the probe, antenna axes (m)
+    axis: Array  # (n, 3), measured direction, unit vectors, antenna axes
+    # reading, sigma: (n,), signed amplitude, and its standard deviation (T)
     reading: Array
     sigma: Array
 

@@ -22,37 +22,21 @@ class Observation:
     """Predicted phasors of one beacon with their Jacobian blocks.
 
     Every block has the shape of ``phasor_sensor`` with one axis more, of the length given.
-
-    Parameters
-    ----------
-    phasor_sensor : complex ndarray, shape (..., tones, 3)
-        (T), measured axes.
-    platform_pose : complex ndarray, 6
-        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
-    beacon_pose : complex ndarray, 6
-        Right perturbation of world_from_beacon: rotation, translation, beacon axes.
-    log_moments : complex ndarray, coils
-        Logarithm of each coil's moment (T).
-    phase : complex ndarray
-        Drive phase of the phasor's own tone; no further axis (T/rad).
-    matrix : complex ndarray, 9
-        Magnetometer matrix, row by row (T).
-    body_from_sensor : complex ndarray, 6
-        Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
-    time_offset : complex ndarray, optional
-        IMU time offset; no further axis (T/s).  None where no twist was given.
-    log_conductivity : complex ndarray, optional
-        Logarithm of the ground's conductivity; no further axis (T).  None without conduction.
     """
 
-    phasor_sensor: ComplexArray
+    phasor_sensor: ComplexArray  # (..., tones, 3) (T), measured axes
+    # 6, right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m)
     platform_pose: ComplexArray
+    # 6, right perturbation of world_from_beacon: rotation, translation, beacon axes
     beacon_pose: ComplexArray
-    log_moments: ComplexArray
-    phase: ComplexArray
-    matrix: ComplexArray
+    log_moments: ComplexArray  # logarithm of each coil's moment (T)
+    phase: ComplexArray  # drive phase of the phasor's own tone; no further axis (T/rad)
+    matrix: ComplexArray  # 9, magnetometer matrix, row by row (T)
+    # 6, right perturbation of the sensor's pose in the body: rotation, translation, sensor axes
     body_from_sensor: ComplexArray
+    # IMU time offset; no further axis (T/s). None where no twist was given
     time_offset: ComplexArray | None
+    # logarithm of the ground's conductivity; no further axis (T). None without conduction
     log_conductivity: ComplexArray | None = None
 
 
@@ -95,15 +79,11 @@ def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
 
 def joined_phasors(separately: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
     """Return the phasors of the coils from those (..., tones, 3) at `points_apart`."""
-    return _joined_axes(separately, magnetometer)
+    return joined_axes(separately, magnetometer)
 
 
-def joined_samples(separately: list[Array], magnetometer: Magnetometer) -> Array:
-    """Return the samples of the coils from those (..., 3) at `points_apart`."""
-    return _joined_axes(separately, magnetometer)
-
-
-def _joined_axes(separately: Sequence[Any], magnetometer: Magnetometer) -> Any:
+def joined_axes(separately: Sequence[Any], magnetometer: Magnetometer) -> Any:
+    """Return the values (..., 3) of the coils from those at `points_apart`."""
     weights = _along(magnetometer)[1]
     count = len(weights)
     rows = [

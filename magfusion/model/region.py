@@ -15,31 +15,17 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """One side of a plane.
+    """One side of a plane."""
 
-    Parameters
-    ----------
-    normal_world : ndarray, shape (3,)
-        Normal of any length, towards the magnetometer.
-    through_world : ndarray, shape (3,)
-        A point of the plane (m).
-    """
-
-    normal_world: Array
-    through_world: Array
+    normal_world: Array  # (3,), normal of any length, towards the magnetometer
+    through_world: Array  # (3,), a point of the plane (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Region that contains the magnetometer, independent of the fields.
+    """Region that contains the magnetometer, independent of the fields."""
 
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3), optional
-        Lower and upper corner (m); infinite where there is no limit.
-    half_space : HalfSpace, optional
-    """
-
+    # (2, 3), lower and upper corner (m); infinite where there is no limit
     box_world: Array | None = None
     half_space: HalfSpace | None = None
 
@@ -56,21 +42,11 @@ class _Source(Protocol):
 
 
 class Bounds(NamedTuple):
-    """Planes that bound the magnetometer's position.
+    """Planes that bound the magnetometer's position."""
 
-    Parameters
-    ----------
-    normal_world : ndarray, shape (k, 3)
-        Unit vectors inwards.
-    offset : ndarray, shape (k,)
-        Inside, ``normal_world @ position`` is larger (m).
-    names : tuple of str
-        Of the planes, for messages.
-    """
-
-    normal_world: Array
-    offset: Array
-    names: tuple[str, ...]
+    normal_world: Array  # (k, 3), unit vectors inwards
+    offset: Array  # (k,), inside, ``normal_world @ position`` is larger (m)
+    names: tuple[str, ...]  # of the planes, for messages
 
     def margin(self, position_world: Array) -> Array:
         """Return the distance inside each plane, shape (..., k) (m); negative outside."""
@@ -80,10 +56,7 @@ class Bounds(NamedTuple):
 def bounds_of(region: Region | None, sources: Sequence[_Source]) -> Bounds | None:
     """Return the planes of a region and of the hemispheres of beacons; None if there are none.
 
-    Parameters
-    ----------
-    sources : sequence of Beacon
-        A beacon of unknown position adds no plane.
+    `sources`: a beacon of unknown position adds no plane.
     """
     result: list[tuple[Array, float, str]] = []
     box = None if region is None else region.box_world

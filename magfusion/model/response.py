@@ -20,27 +20,13 @@ POINTS_PER_DECADE = 2000
 
 @dataclass(frozen=True)
 class PickupCoil:
-    """Receive coil with an amplifier: ``V = j w N A g B / (1 - (f/f0)^2 + j f / (f0 Q))``.
+    """Receive coil with an amplifier: ``V = j w N A g B / (1 - (f/f0)^2 + j f / (f0 Q))``."""
 
-    Parameters
-    ----------
-    turns : float
-        N.
-    area : float
-        A, mean of the turns (m^2).
-    resonance_hz : float
-        f0, of its inductance and all capacitance across it.
-    quality : float
-        Q.
-    amplifier_gain : float
-        g.
-    """
-
-    turns: float
-    area: float
-    resonance_hz: float
-    quality: float
-    amplifier_gain: float
+    turns: float  # N
+    area: float  # a, mean of the turns (m^2)
+    resonance_hz: float  # f0, of its inductance and all capacitance across it
+    quality: float  # Q
+    amplifier_gain: float  # g
 
     def volts_per_tesla(self, frequency_hz: Array) -> ComplexArray:
         """Return the sensitivity to alternating fields (V/T), shape (n,)."""
@@ -51,24 +37,12 @@ class PickupCoil:
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """Response of all three axes, or of one.
+    """Response of all three axes, or of one."""
 
-    Parameters
-    ----------
-    frequency_hz : ndarray, shape (n,)
-        Increasing, above zero (Hz).
-    gain : ndarray, shape (n,)
-        Measured amplitude relative to the field's.
-    phase : ndarray, shape (n,)
-        Measured phase relative to the field's (rad); negative for a lag.
-    coil : PickupCoil, optional
-        Whose response it is.
-    """
-
-    frequency_hz: Array
-    gain: Array
-    phase: Array
-    coil: PickupCoil | None = None
+    frequency_hz: Array  # (n,), increasing, above zero (Hz)
+    gain: Array  # (n,), measured amplitude relative to the field's
+    phase: Array  # (n,), measured phase relative to the field's (rad); negative for a lag
+    coil: PickupCoil | None = None  # whose response it is
 
     @staticmethod
     def of_coil(coil: PickupCoil) -> "FrequencyResponse":
@@ -100,12 +74,7 @@ class FrequencyResponse:
 
 @dataclass(frozen=True, eq=False)
 class AxisResponses:
-    """Responses of axes that differ.
-
-    Parameters
-    ----------
-    x, y, z : FrequencyResponse
-    """
+    """Responses of axes that differ."""
 
     x: FrequencyResponse
     y: FrequencyResponse
@@ -126,20 +95,11 @@ class ResponseSigma:
     """Prior standard deviations of the responses of y and z relative to x; zero means known.
 
     What all axes share cannot be distinguished from a beacon's moment and drive phase.
-
-    Parameters
-    ----------
-    frequency_hz : ndarray, shape (k,)
-        Increasing; of all tones at least (Hz).
-    gain : ndarray, shape (k, 2)
-        Of the logarithm.
-    phase : ndarray, shape (k, 2)
-        (rad)
     """
 
-    frequency_hz: Array
-    gain: Array
-    phase: Array
+    frequency_hz: Array  # (k,), increasing; of all tones at least (Hz)
+    gain: Array  # (k, 2), of the logarithm
+    phase: Array  # (k, 2) (rad)
 
 
 def log_response(
@@ -157,12 +117,7 @@ def changed_axes(
 ) -> AxisResponses:
     """Return a response at the given frequencies with y and z changed.
 
-    Parameters
-    ----------
-    frequency_hz : ndarray, shape (k,)
-        Increasing (Hz).
-    change : complex ndarray, shape (k, 2)
-        Of log-gain + 1j phase.
+    `frequency_hz` (k,): increasing (Hz). `change` (k, 2): of log-gain + 1j phase.
     """
     log = log_response(response, frequency_hz)
     log[:, 1:] += change

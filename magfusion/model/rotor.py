@@ -10,21 +10,11 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Harmonic:
-    """Part of the moment at a multiple of the shaft's angle, or steady along the shaft.
+    """Part of the moment at a multiple of the shaft's angle, or steady along the shaft."""
 
-    Parameters
-    ----------
-    order : int
-        Multiple of the angle: ``moment_beacon * cos(order * angle + phase)``.
-    moment_beacon : ndarray, shape (3,)
-        Peak (A m^2).
-    phase : float
-        (rad)
-    """
-
-    order: int
-    moment_beacon: Array
-    phase: float = 0.0
+    order: int  # multiple of the angle: ``moment_beacon * cos(order * angle + phase)``
+    moment_beacon: Array  # (3,), peak (A m^2)
+    phase: float = 0.0  # (rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,37 +23,22 @@ class Rotor:
 
     ``m(angle) = moment cos(tilt) (zero cos(angle) + (axis x zero) sin(angle)) + moment sin(tilt)
     axis``, and harmonics.  The part along the axis is steady and appears in no tone.
-
-    Parameters
-    ----------
-    moment : float
-        (A m^2)
-    axis_beacon : ndarray, shape (3,)
-        Unit vector of rotation by the right-hand rule; for a magnet in a well down the hole.
-    zero_beacon : ndarray, shape (3,)
-        Unit vector perpendicular to the axis, along the moment at angle zero.
-    tilt : float
-        Of the moment out of the plane perpendicular to the axis (rad).
-    ellipse_sigma : float
-        Of the ellipticity of the moment, each of two numbers, relative to the moment: from an
-        angle error of two periods a turn, as by a joint or iron around the magnet.
-    speed_sigma_hz : float
-        Of the speed about the declared frequency, where the angle is not measured.
-    speed_walk_hz_rts : float
-        Random walk of the speed, gained in one second, one sigma.
-    length : float
-        Of the magnets along the shaft (m).
     """
 
-    moment: float
+    moment: float  # (A m^2)
+    # (3,), unit vector of rotation by the right-hand rule; for a magnet in a well down the hole
     axis_beacon: Array
+    # (3,), unit vector perpendicular to the axis, along the moment at angle zero
     zero_beacon: Array
-    tilt: float = 0.0
+    tilt: float = 0.0  # of the moment out of the plane perpendicular to the axis (rad)
     harmonics: tuple[Harmonic, ...] = ()
+    # of the ellipticity of the moment, each of two numbers, relative to the moment: from an angle
+    # error of two periods a turn, as by a joint or iron around the magnet
     ellipse_sigma: float = 0.005
+    # of the speed about the declared frequency, where the angle is not measured
     speed_sigma_hz: float = 0.1
-    speed_walk_hz_rts: float = 0.01
-    length: float = 0.0
+    speed_walk_hz_rts: float = 0.01  # random walk of the speed, gained in one second, one sigma
+    length: float = 0.0  # of the magnets along the shaft (m)
 
     @property
     def turning_moments(self) -> Array:
@@ -74,30 +49,19 @@ class Rotor:
 
 @dataclass(frozen=True, eq=False)
 class RotorAngles:
-    """Shaft angles from encoders, recorded with the magnetometer.
+    """Shaft angles from encoders, recorded with the magnetometer."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, strictly increasing.
-    angle : mapping of str to ndarray, shape (n,)
-        Of each rotor, by its beacon's name (rad), wrapped or unwrapped.
-    """
-
-    time: Array
+    time: Array  # (n,), seconds since the log's epoch, strictly increasing
+    # (n,) each, of each rotor, by its beacon's name (rad), wrapped or unwrapped
     angle: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Measured depth along its hole of a part: a beacon, or the magnetometer.
+    """Measured depth along its hole of a part: a beacon, or the magnetometer."""
 
-    Parameters
-    ----------
-    readings : mapping of str to ndarray, shape (2, n)
-        Times, increasing (s), and measured depths (m); linear in between, constant beyond.
-    """
-
+    # (2, n) each, times, increasing (s), and measured depths (m); linear in between, constant
+    # beyond
     readings: Mapping[str, Array]
 
     def at(self, part: str, time: Array) -> Array | None:

@@ -21,23 +21,13 @@ LONGEST_IN_MOTION = 5.0  # s; of a window, unless the platform rests
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
-    """Inertial stream.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, strictly increasing; the IMU's own stamps.
-    gyro_body : ndarray, shape (n, 3)
-        Angular rate (rad/s).
-    accel_body : ndarray, shape (n, 3)
-        Specific force (m/s^2): +g on z at rest, level.
-    """
+    """Inertial stream."""
 
     __repr__ = short_repr
 
-    time: Array
-    gyro_body: Array
-    accel_body: Array
+    time: Array  # (n,), seconds since the log's epoch, strictly increasing; the IMU's own stamps
+    gyro_body: Array  # (n, 3), angular rate (rad/s)
+    accel_body: Array  # (n, 3), specific force (m/s^2): +g on z at rest, level
 
     def __len__(self) -> int:
         return len(self.time)
@@ -50,29 +40,17 @@ class ImuSamples:
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
-    """Raw magnetometer stream of the instrument.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, strictly increasing.
-    measured_sensor : ndarray, shape (n, 3)
-        Uncalibrated flux density (T); zero in the columns of axes that the receiver lacks.
-    marks : Marks, optional
-        Times at which coils were driven, if recorded; includes bursts outside the samples.
-    axes : str
-        Axes of the receiver; the other columns are invalid.
-    ac_coupled : bool
-        Whether the samples hold no steady field.
-    """
+    """Raw magnetometer stream of the instrument."""
 
     __repr__ = short_repr
 
-    time: Array
+    time: Array  # (n,), seconds since the log's epoch, strictly increasing
+    # (n, 3), uncalibrated flux density (T); zero in the columns of axes that the receiver lacks
     measured_sensor: Array
+    # times at which coils were driven, if recorded; includes bursts outside the samples
     marks: Marks | None = None
-    axes: str = "xyz"
-    ac_coupled: bool = False
+    axes: str = "xyz"  # axes of the receiver; the other columns are invalid
+    ac_coupled: bool = False  # whether the samples hold no steady field
 
     def __len__(self) -> int:
         return len(self.time)
@@ -263,23 +241,13 @@ class FieldSamples:
 
 @dataclass(frozen=True, eq=False)
 class SteadyFields:
-    """Steady part of the waveform, one row for each window: the Earth field and the offset.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Centre of the window, seconds since the log's epoch.
-    measured_sensor : ndarray, shape (n, 3)
-        (T), measured axes at the centre.
-    cov : ndarray, shape (n, 3, 3)
-        Of the instrument's noise alone (T^2).
-    """
+    """Steady part of the waveform, one row for each window: the Earth field and the offset."""
 
     __repr__ = short_repr
 
-    time: Array
-    measured_sensor: Array
-    cov: Array
+    time: Array  # (n,), centre of the window, seconds since the log's epoch
+    measured_sensor: Array  # (n, 3) (T), measured axes at the centre
+    cov: Array  # (n, 3, 3), of the instrument's noise alone (T^2)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -291,26 +259,14 @@ class SteadyFields:
 
 @dataclass(frozen=True)
 class StreamClock:
-    """Time stamps of a stream relative to its uniform sampling clock.
+    """Time stamps of a stream relative to its uniform sampling clock."""
 
-    Parameters
-    ----------
-    step : float
-        Between two samples (s).
-    scatter : float
-        Root mean square of the stamps about the clock (s).
-    lost_count : int
-        Missing samples outside gaps.
-    replaced : bool
-        Whether the clock replaces the stamps; otherwise the samples were taken at the stamps.
-    resolution : float
-        To which the stamps were rounded (s), where that explains their scatter; otherwise zero.
-    """
-
-    step: float
-    scatter: float
-    lost_count: int
+    step: float  # between two samples (s)
+    scatter: float  # root mean square of the stamps about the clock (s)
+    lost_count: int  # missing samples outside gaps
+    # whether the clock replaces the stamps; otherwise the samples were taken at the stamps
     replaced: bool
+    # to which the stamps were rounded (s), where that explains their scatter; otherwise zero
     resolution: float = 0.0
 
 

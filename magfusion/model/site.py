@@ -31,20 +31,14 @@ from magfusion.units import Array, IntArray
 
 @dataclass(frozen=True)
 class ClockModel:
-    """Clock of an unsynchronised beacon, and stability of all drives.
+    """Clock of an unsynchronised beacon, and stability of all drives."""
 
-    Parameters
-    ----------
-    drift_sigma, drift_largest : float
-        Prior sigma of a clock's relative error, as of an ordinary crystal; and the largest error
-        that is searched.
-    phase_walk, drift_walk, log_moment_walk : float
-        Standard deviation that drive phase (rad), relative error of the clock, and logarithm of a
-        moment gain in an hour, by temperature and ageing.
-    """
-
+    # drift_sigma, drift_largest: prior sigma of a clock's relative error, as of an ordinary
+    # crystal; and the largest error that is searched
     drift_sigma: float = 2e-5
     drift_largest: float = 1e-4
+    # phase_walk, drift_walk, log_moment_walk: standard deviation that drive phase (rad), relative
+    # error of the clock, and logarithm of a moment gain in an hour, by temperature and ageing
     phase_walk: float = 0.02
     drift_walk: float = 1e-8
     log_moment_walk: float = 1e-3
@@ -52,55 +46,32 @@ class ClockModel:
 
 @dataclass(frozen=True)
 class EarthModel:
-    """Change of the declared Earth field by a building's iron, outside of steel halls.
+    """Change of the declared Earth field by a building's iron, outside of steel halls."""
 
-    Parameters
-    ----------
-    declination_sigma : float
-        Of its azimuth (rad).
-    strength_sigma : float
-        Of its horizontal and of its vertical part, relative to its size.
-    declination_walk, strength_walk : float
-        Standard deviation that azimuth (rad) and parts (T) gain in an hour: the field changes as
-        the platform moves.
-    """
-
-    declination_sigma: float = float(np.deg2rad(3.0))
-    strength_sigma: float = 0.02
+    declination_sigma: float = float(np.deg2rad(3.0))  # of its azimuth (rad)
+    strength_sigma: float = 0.02  # of its horizontal and of its vertical part, relative to its size
+    # declination_walk, strength_walk: standard deviation that azimuth (rad) and parts (T) gain in
+    # an hour: the field changes as the platform moves
     declination_walk: float = 0.05
     strength_walk: float = 1e-6
 
 
 @dataclass(frozen=True)
 class Platform:
-    """Moving platform: an IMU and one or several magnetometers, rigidly mounted together.
-
-    Parameters
-    ----------
-    magnetometer : Magnetometer
-        The single or first one.
-    further : tuple of Magnetometer
-        The other magnetometers.
-    left_out : tuple of (int, Magnetometer)
-        Magnetometers excluded for a log, each with its index at that time.
-    imu_intrinsics : ImuIntrinsics, optional
-        Scale factors, axes and g-sensitivity of the IMU; None if it is ideal.
-    motion_prior : MotionPrior, optional
-        Assumed motion if a log has no inertial samples.
-    replaced : Replaced, optional
-        Parts that the prior replaces (`magfusion.model.without_imu`); None if the IMU
-        measures.
-    """
+    """Moving platform: an IMU and one or several magnetometers, rigidly mounted together."""
 
     __repr__ = short_repr
 
     imu: ImuModel
-    magnetometer: Magnetometer
+    magnetometer: Magnetometer  # the single or first one
     motion: MotionModel = A_HAND
-    motion_prior: MotionPrior | None = None
+    motion_prior: MotionPrior | None = None  # assumed motion if a log has no inertial samples
+    # parts that the prior replaces (`magfusion.model.without_imu`); None if the IMU measures
     replaced: Replaced | None = None
-    further: tuple[Magnetometer, ...] = ()
+    further: tuple[Magnetometer, ...] = ()  # the other magnetometers
+    # magnetometers excluded for a log, each with its index at that time
     left_out: tuple[tuple[int, Magnetometer], ...] = ()
+    # scale factors, axes and g-sensitivity of the IMU; None if it is ideal
     imu_intrinsics: ImuIntrinsics | None = None
 
     @property

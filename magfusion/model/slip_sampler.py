@@ -41,14 +41,8 @@ class SlipSampler:
     """Reduces a recording, as `BandSampler`, to samples numbered on the true clock.
 
     Samples are withheld from a step of the tones' amplitudes on, until those after it determine
-    what it is.
-
-    Attributes
-    ----------
-    slips : list of Slip
-        As far as they are found.
-    unexplained : int
-        Steps of the tones' phases that no number of lost samples explains.
+    what it is. `slips`: as far as they are found. `unexplained`: steps of the tones' phases that no
+    number of lost samples explains.
     """
 
     def __init__(self, band: BandFilter, site: Site) -> None:

@@ -30,21 +30,11 @@ POOR = 0.1  # part of the amplitudes that the best length leaves unexplained
 
 @dataclass(frozen=True)
 class Slip:
-    """Samples that an even stream lacks.
+    """Samples that an even stream lacks."""
 
-    Parameters
-    ----------
-    place : int
-        Number of the first sample after it, as counted in the stream.
-    missing : int
-        Number of the missing samples.
-    others : tuple of int
-        Numbers that explain the phases nearly as well.
-    """
-
-    place: int
-    missing: int
-    others: tuple[int, ...] = ()
+    place: int  # number of the first sample after it, as counted in the stream
+    missing: int  # number of the missing samples
+    others: tuple[int, ...] = ()  # numbers that explain the phases nearly as well
 
 
 def log_likelihoods(
@@ -56,14 +46,9 @@ def log_likelihoods(
 ) -> Array:
     """Return the log-likelihood of each number of lost samples, from zero to the largest.
 
-    Parameters
-    ----------
-    before, after : tuple of ndarray, complex ndarray, shapes (n,), (n, tones, columns)
-        Number of the sample, and amplitudes that are referred to it by the tones' phases.
-    noise : ndarray, shape (tones,)
-        Standard deviation of each real part of an amplitude.
-    tones_hz : ndarray, shape (tones,)
-    rate_hz : float
+    `before`, `after` (n,), (n, tones, columns): number of the sample, and amplitudes that are
+    referred to it by the tones' phases. `noise` (tones,): standard deviation of each real part of
+    an amplitude. `tones_hz` (tones,).
     """
     lengths = np.arange(round(LONGEST * rate_hz) + 1)
     step = max(round(GRID * rate_hz), 1)

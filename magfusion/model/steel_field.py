@@ -21,20 +21,11 @@ class SteelField:
     """Voxels of steel and their moments.
 
     They neither move with the beacon nor grow with its moments, which change by little.
-
-    Parameters
-    ----------
-    centre_world : ndarray, shape (v, 3)
-        (m)
-    radius : ndarray, shape (v,)
-        (m)
-    moment_world : ndarray, shape (v, coils, 3)
-        By each coil at its peak current (A m^2).
     """
 
-    centre_world: Array
-    radius: Array
-    moment_world: Array
+    centre_world: Array  # (v, 3) (m)
+    radius: Array  # (v,) (m)
+    moment_world: Array  # (v, coils, 3), by each coil at its peak current (A m^2)
 
     @property
     def coils(self) -> int:
@@ -57,17 +48,8 @@ class SteelField:
     def fields_and_gradients(self, position_world: Array) -> tuple[Array, Array]:
         """Return the field and its gradient.
 
-        Parameters
-        ----------
-        position_world : ndarray, shape (..., 3)
-            (m)
-
-        Returns
-        -------
-        field : ndarray, shape (..., coils, 3)
-            World axes (T).
-        gradient : ndarray, shape (..., coils, 3, 3)
-            ``[i, j] = d field_i / d position_j`` (T/m).
+        `position_world` (..., 3) (m). Returns `field` (..., coils, 3): world axes (T);
+        `gradient` (..., coils, 3, 3): ``[i, j] = d field_i / d position_j`` (T/m).
         """
         near = list(self._near(position_world))
         shape = *position_world.shape[:-1], self.coils, 3

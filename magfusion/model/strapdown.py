@@ -44,17 +44,8 @@ def _prefix_products(quaternion: Array) -> Array:
 def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
     """Return ``body(0)_from_body(k)`` for every sample.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    gyro_body : ndarray, shape (n, 3)
-        (rad/s), bias removed.
-
-    Returns
-    -------
-    Rotation
-        n rotations, the first the identity.
+    `time` (n,) (s). `gyro_body` (n, 3) (rad/s), bias removed. Returns n rotations, the first the
+    identity.
     """
     return Rotation.from_quat(turn_from_gyro(time, gyro_body).T, scalar_first=True)
 
@@ -75,20 +66,9 @@ def turn_from_gyro(time: Array, gyro_body: Array) -> Array:
 def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
     """Return the attitude at other times, from the nearest earlier sample and its rate.
 
-    Parameters
-    ----------
-    attitude : Rotation
-        One for each sample, as from `attitude_from_gyro`.
-    time : ndarray, shape (n,)
-    gyro_body : ndarray, shape (n, 3)
-        (rad/s)
-    wanted : ndarray, shape (m,)
-        Times (s); outside the stream the end rate is extended.
-
-    Returns
-    -------
-    Rotation
-        m rotations.
+    `attitude`: one for each sample, as from `attitude_from_gyro`. `time` (n,), `gyro_body` (n, 3)
+    (rad/s). `wanted` (m,): times (s); outside the stream the end rate is extended. Returns m
+    rotations.
     """
     result = turn_at(components(attitude), time, gyro_body, wanted)
     return Rotation.from_quat(result.T, scalar_first=True)
@@ -108,19 +88,9 @@ def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
 def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
     """Return the attitude at some times; faster than all samples for a long stream.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    gyro_body : ndarray, shape (n, 3)
-        (rad/s), bias removed.
-    wanted : ndarray, shape (m,)
-        Times (s); outside the stream the end rate is extended.
-
-    Returns
-    -------
-    Rotation
-        m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
+    `time` (n,) (s). `gyro_body` (n, 3) (rad/s), bias removed. `wanted` (m,): times (s); outside the
+    stream the end rate is extended. Returns m rotations, as of `attitude_at` on the chain of
+    `attitude_from_gyro`.
     """
     return Rotation.from_quat(turn_from_gyro_at(time, gyro_body, wanted).T, scalar_first=True)
 
@@ -175,15 +145,8 @@ def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -
 def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
     """Return the means of sampled vectors over a span centred at some times, shape (m, 3).
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    vector : ndarray, shape (n, 3)
-    wanted : ndarray, shape (m,)
-        (s)
-    span : float
-        Without a sample in it, the nearest one is used (s).
+    `time` (n,) (s), `vector` (n, 3), `wanted` (m,) (s). `span`: without a sample in it, the nearest
+    one is used (s).
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(vector, axis=0)])
     lo = np.searchsorted(time, wanted - span / 2)
@@ -196,16 +159,8 @@ def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
 def triad(field_world: Array, up_body: Array, field_body: Array) -> Array:
     """Return attitudes with the vertical exact and the heading from the field (TRIAD).
 
-    Parameters
-    ----------
-    field_world : ndarray, shape (3,)
-        Of any length, as all vectors here; not vertical.
-    up_body, field_body : ndarray, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        world_from_body.
+    `field_world` (3,): of any length, as all vectors here; not vertical. `up_body`,
+    `field_body` (..., 3). Returns (..., 3, 3): world_from_body.
     """
 
     def axes(up: Array, field: Array) -> Array:
@@ -229,23 +184,10 @@ def resting(
 ) -> BoolArray:
     """Return at which samples the platform is at rest.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    gyro_body, accel_body : ndarray, shape (n, 3)
-        (rad/s, m/s^2)
-    span : float, optional
-        Length of the stretch around each sample that must be quiet (s), overriding the model's.
-    motion : MotionModel
-        Thresholds of rest.
-    at : int ndarray, shape (k,), optional
-        Samples to test; default all.
-
-    Returns
-    -------
-    bool ndarray, shape (n,) or (k,)
-        Where rate and specific force scatter about their means by less than the thresholds.
+    `time` (n,) (s), `gyro_body`, `accel_body` (n, 3) (rad/s, m/s^2). `span`: length of the stretch
+    around each sample that must be quiet (s), overriding the model's. `motion`: thresholds of rest.
+    `at` (k,): samples to test; default all. Returns (n,) or (k,): where rate and specific force
+    scatter about their means by less than the thresholds.
     """
     span = motion.rest_span if span is None else span
     centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])

@@ -11,17 +11,10 @@ SMALL = 0.03  # rad; below it the series are as accurate as the closed forms
 
 
 class StepMotion(NamedTuple):
-    """Increments of steps, in body axes at the beginning of each.
+    """Increments of steps, in body axes at the beginning of each."""
 
-    Parameters
-    ----------
-    rotation : ndarray, shape (n, 3, 3)
-        ``before_from_after``.
-    velocity, position : ndarray, shape (n, 3)
-        Gain from the specific force alone (m/s, m).
-    """
-
-    rotation: Array
+    rotation: Array  # (n, 3, 3), ``before_from_after``
+    # velocity, position: (n, 3), gain from the specific force alone (m/s, m)
     velocity: Array
     position: Array
 
@@ -29,12 +22,7 @@ class StepMotion(NamedTuple):
 def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> StepMotion:
     """Return the increments of steps with constant rate and specific force in body axes.
 
-    Parameters
-    ----------
-    gyro_body, accel_body : ndarray, shape (n, 3)
-        (rad/s, m/s^2)
-    dt : ndarray, shape (n,)
-        (s)
+    `gyro_body`, `accel_body` (n, 3) (rad/s, m/s^2), `dt` (n,) (s).
     """
     turn, length = gyro_body * dt[:, None], dt[:, None]
     square = np.sum(turn**2, axis=1)

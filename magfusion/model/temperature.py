@@ -9,61 +9,33 @@ from itertools import repeat
 
 import numpy as np
 
+from magfusion.model.drive import MAX_READINGS
 from magfusion.units import Array
 
 MAGNETOMETER = "magnetometer"  # name of that part; all others are beacons
-MAX_READINGS = 1000  # readings of each part that a running estimator keeps
 
 
 @dataclass(frozen=True)
 class MomentTemperatureModel:
-    """Temperature dependence of the moments of a beacon's coils.
+    """Temperature dependence of the moments of a beacon's coils."""
 
-    Parameters
-    ----------
-    log_moment_per_k : float
-        Of the logarithm of all its moments (1/K).
-    reference_degc : float
-        Temperature for which they are declared (degrees Celsius).
-    """
-
-    log_moment_per_k: float
-    reference_degc: float = 20.0
+    log_moment_per_k: float  # of the logarithm of all its moments (1/K)
+    reference_degc: float = 20.0  # temperature for which they are declared (degrees Celsius)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorTemperatureModel:
-    """Temperature dependence of a magnetometer's matrix and offset.
+    """Temperature dependence of a magnetometer's matrix and offset."""
 
-    Parameters
-    ----------
-    matrix_per_k : ndarray, shape (3, 3)
-        (1/K)
-    offset_per_k : ndarray, shape (3,)
-        (T/K)
-    reference_degc : float
-        Temperature for which both are declared (degrees Celsius).
-    """
-
-    matrix_per_k: Array
-    offset_per_k: Array
-    reference_degc: float = 20.0
+    matrix_per_k: Array  # (3, 3) (1/K)
+    offset_per_k: Array  # (3,) (T/K)
+    reference_degc: float = 20.0  # temperature for which both are declared (degrees Celsius)
 
     def to_reference(self, matrix: Array, degc: Array) -> tuple[Array, Array]:
         """Return the matrix that corrects samples to the reference temperature, and their offset.
 
-        Parameters
-        ----------
-        matrix : ndarray, shape (3, 3)
-            Of the magnetometer.
-        degc : ndarray, shape (n,)
-
-        Returns
-        -------
-        ndarray, shape (n, 3, 3)
-            Applied to samples after subtraction of the offset.
-        ndarray, shape (n, 3)
-            Increase of the offset (T).
+        `matrix` (3, 3): of the magnetometer. `degc` (n,). Returns (n, 3, 3): applied to samples
+        after subtraction of the offset; (n, 3): increase of the offset (T).
         """
         warmer = np.asarray(degc) - self.reference_degc
         grown = np.eye(3) + warmer[:, None, None] * (self.matrix_per_k @ np.linalg.inv(matrix))
@@ -73,10 +45,8 @@ class SensorTemperatureModel:
 class Temperatures:
     """Readings of several parts, complete or streamed.
 
-    Parameters
-    ----------
-    readings : mapping of str to ndarray, optional
-        Of each part, shape (2, n): times, increasing (s), and temperatures (degrees Celsius).
+    `readings`: of each part, shape (2, n): times, increasing (s), and temperatures (degrees
+    Celsius).
     """
 
     readings: dict[str, Array]  # part of a checkpoint

@@ -9,21 +9,11 @@ from magfusion.units import Array, IntArray
 
 @dataclass(frozen=True)
 class Slots:
-    """Time division: the coils of a beacon are driven in turn, slot after slot, cycle after cycle.
+    """Time division: the coils of a beacon are driven in turn, slot by slot, cycle after cycle."""
 
-    Parameters
-    ----------
-    duration : float
-        Of one slot (s).
-    count : int
-        Slots in a cycle; those without a coil are silent.
-    start : float
-        Begin of slot 0 of a cycle on the log's clock (s).
-    """
-
-    duration: float
-    count: int
-    start: float = 0.0
+    duration: float  # of one slot (s)
+    count: int  # slots in a cycle; those without a coil are silent
+    start: float = 0.0  # begin of slot 0 of a cycle on the log's clock (s)
 
     @property
     def cycle(self) -> float:

@@ -14,6 +14,7 @@ from magfusion.model.short_repr import one_line
 from magfusion.units import Array, IntArray
 
 # Meaning of findings by code: the documentation of ``reasons`` in report.json.
+LISTED = 3  # items of a kind in a sentence; more are counted, or left out
 CODES = {
     "accel_scale": "the mean specific force is not gravity's, by a scale or a bias",
     "accel_units": "the specific force is in another unit",
@@ -225,20 +226,12 @@ def _importance(finding: Finding) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class Unverified:
-    """A fixed parameter that is not observable in these data.
+    """A fixed parameter that is not observable in these data."""
 
-    Parameters
-    ----------
-    name : str
-        As in ``report.json``: owner and kind.
-    sigma : str
-        Its declared standard deviation, with unit.
-    position_m, rotation_deg : float
-        Effect of one declared sigma on the pose, root mean square along the log.
-    """
-
-    name: str
-    sigma: str
+    name: str  # as in ``report.json``: owner and kind
+    sigma: str  # its declared standard deviation, with unit
+    # position_m, rotation_deg: effect of one declared sigma on the pose, root mean square along the
+    # log
     position_m: float
     rotation_deg: float
 
@@ -281,21 +274,13 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class StateTrust:
-    """Trust in each state of a trajectory.
-
-    Parameters
-    ----------
-    verdict : tuple of Verdict
-    protection_level_m, protection_level_deg : ndarray, shape (n,)
-        NaN where there is none.
-    excluded : tuple of tuple of str
-        Beacons excluded from each state.
-    """
+    """Trust in each state of a trajectory."""
 
     verdict: tuple[Verdict, ...]
+    # protection_level_m, protection_level_deg: (n,), NaN where there is none
     protection_level_m: Array
     protection_level_deg: Array
-    excluded: tuple[tuple[str, ...], ...] = field(default=())
+    excluded: tuple[tuple[str, ...], ...] = field(default=())  # beacons excluded from each state
 
     def rows(self, chosen: IntArray) -> "StateTrust":
         """Return a subset of the states, possibly repeated."""
@@ -309,10 +294,7 @@ class StateTrust:
     def within(self, whole: Verdict, widened: Array) -> "StateTrust":
         """Combine states with the verdict on the whole result, whose covariance was inflated.
 
-        Parameters
-        ----------
-        widened : ndarray, shape (n, 2)
-            Deviations of attitude and position, relative to those before.
+        `widened` (n, 2): deviations of attitude and position, relative to those before.
         """
         factor = np.full(widened.shape, np.nan) if whole is Verdict.FAILED else widened
         return StateTrust(
@@ -331,21 +313,10 @@ def uniform_trust(count: int, verdict: Verdict) -> StateTrust:
 
 @dataclass(frozen=True)
 class Risk:
-    """Integrity and continuity risk.
+    """Integrity and continuity risk."""
 
-    Parameters
-    ----------
-    total : float
-        Probability per epoch that position or attitude exceeds its level without an alarm.
-    fault : float
-        Prior probability of a faulty beacon, per beacon and epoch.
-    false_alarm : float
-        Probability of an alarm in an epoch without a fault.
-    mirrors : float
-        Share of the total allocated to alternative poses.
-    """
-
+    # probability per epoch that position or attitude exceeds its level without an alarm
     total: float = 1e-4
-    fault: float = 1e-3
-    false_alarm: float = 5e-4
-    mirrors: float = 0.1
+    fault: float = 1e-3  # prior probability of a faulty beacon, per beacon and epoch
+    false_alarm: float = 5e-4  # probability of an alarm in an epoch without a fault
+    mirrors: float = 0.1  # share of the total allocated to alternative poses

@@ -14,25 +14,17 @@ from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
 from magfusion.model.path_field import field_along_path
 from magfusion.model.quaternion import cross
-from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
+from magfusion.model.receive_coils import is_apart, joined_axes, points_apart
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
 class MotionChange(NamedTuple):
-    """Rate of change of a motion, shape (n, 3) both, world axes.
+    """Rate of change of a motion, shape (n, 3) both, world axes."""
 
-    Parameters
-    ----------
-    rotation_world : ndarray
-        (rad/s, or rad per unit of another variable)
-    position_world : ndarray
-        Of the body (m/s)
-    """
-
-    rotation_world: Array
-    position_world: Array
+    rotation_world: Array  # (rad/s, or rad per unit of another variable)
+    position_world: Array  # of the body (m/s)
 
 
 def carriers(frequencies_hz: Array, time: Array) -> ComplexArray:
@@ -116,7 +108,7 @@ def _read(
         _at_point(at, motion, calibration.site, earth_field_world, currents, change, through_nodes)
         for at in points_apart(magnetometer)
     ]
-    field, by = (joined_samples([part[k] for part in separate], magnetometer) for k in range(2))
+    field, by = (joined_axes([part[k] for part in separate], magnetometer) for k in range(2))
     return field + magnetometer.offset, by
 
 

@@ -137,12 +137,7 @@ def _at_clock_rate(log: Log, rate: float) -> Log:
 
 
 def require_motion_prior(site: Site) -> None:
-    """Reject a site without a motion prior.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject a site without a motion prior."""
     if not site.platform.inertial and site.platform.motion_prior is None:
         raise InputError(
             "has no inertial samples (imu.parquet), and its site has no platform.motion_prior;"

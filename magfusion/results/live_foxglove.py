@@ -7,7 +7,8 @@ from typing import Any
 from magfusion.errors import InputError
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.stream import json_line
-from magfusion.results.odometry import NS, odometry_of
+from magfusion.results.odometry import odometry_of
+from magfusion.units import NS_PER_S
 
 HOST = "127.0.0.1"
 LINGER = 0.5  # s
@@ -78,7 +79,7 @@ class FoxgloveServer:
 
     def take(self, state: JudgedState | None, reported: Mapping[str, Any]) -> None:
         """Publish a state, and its pose if it has one."""
-        stamp = max(0, self._epoch_ns + round(float(reported["time"]) * NS))
+        stamp = max(0, self._epoch_ns + round(float(reported["time"]) * NS_PER_S))
         self._state.log(json_line(dict(reported)), log_time=stamp)
         if state is None or state.is_lost:
             return
@@ -86,7 +87,7 @@ class FoxgloveServer:
         x, y, z = result.position_world.tolist()
         place = make.Vector3(x=x, y=y, z=z)
         w, x, y, z = result.quaternion.tolist()
-        turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, NS))
+        turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, NS_PER_S))
         pose = make.PoseInFrame(
             timestamp=when, frame_id=self._frame, pose=make.Pose(position=place, orientation=turn)
         )

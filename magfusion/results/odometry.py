@@ -7,9 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.state import ROTATION, VELOCITY, State
 from magfusion.model.fixed_axes import fixed_axes_covariance
-from magfusion.units import Array
-
-NS = 1_000_000_000  # in a second
+from magfusion.units import NS_PER_S, Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +50,7 @@ def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:
     jacobian[:, ROTATION], jacobian[:, VELOCITY] = by_rotation, world_from_body.T
     velocity_cov = jacobian @ state.cov[:9, :9] @ jacobian.T
     return Odometry(
-        stamp_ns=max(0, epoch_ns + round(state.time * NS)),
+        stamp_ns=max(0, epoch_ns + round(state.time * NS_PER_S)),
         position_world=state.position_world,
         quaternion=Rotation.from_matrix(world_from_body).as_quat(scalar_first=True),
         velocity_body=velocity_body,

@@ -9,8 +9,9 @@ from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
 from magfusion.results import ros_messages as ros
 from magfusion.results.dds_domain import dds_name, join_domain
-from magfusion.results.odometry import NS, Odometry, odometry_of
+from magfusion.results.odometry import Odometry, odometry_of
 from magfusion.results.ros_messages import OdometryMessage as Message
+from magfusion.units import NS_PER_S
 
 _DEPTH = 10  # messages that a reader may be late by, as the default of ROS
 
@@ -26,7 +27,7 @@ def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
     pose = ros.Pose(ros.Point(*odometry.position_world.tolist()), ros.Quaternion(x, y, z, w))
     twist = ros.Twist(ros.Vector3(*odometry.velocity_body.tolist()), ros.Vector3(0.0, 0.0, 0.0))
     return ros.OdometryMessage(
-        ros.Header(ros.Time(*divmod(odometry.stamp_ns, NS)), frame),
+        ros.Header(ros.Time(*divmod(odometry.stamp_ns, NS_PER_S)), frame),
         child,
         ros.PoseWithCovariance(pose, odometry.pose_cov.ravel().tolist()),
         ros.TwistWithCovariance(twist, twist_cov.ravel().tolist()),

@@ -18,6 +18,7 @@ from magfusion.files.records import Record
 from magfusion.files.stream import NumberedRecord, checked_record
 from magfusion.model.aiding import AidingSensor
 from magfusion.results.dds_domain import dds_name, join_domain
+from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
     from cyclonedds.domain import DomainParticipant
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 SILENCE = 5.0  # s; a topic without messages for longer is reported
 POLL_NS = 100_000_000  # within which the process answers a signal
 DEPTH = 4096  # samples that may wait: a second of the fastest sensors
-NS = 1e-9  # s
 
 
 class Subscription(NamedTuple):
@@ -212,7 +212,7 @@ def _add(
     content: dict[str, Any], part: str, subscription: Subscription, messages: Sequence[Any]
 ) -> None:
     """Add messages to the content of a record."""
-    stamps = [one.header.stamp.sec + NS * one.header.stamp.nanosec for one in messages]
+    stamps = [one.header.stamp.sec + NANOSECOND * one.header.stamp.nanosec for one in messages]
     own = subscription.content(stamps, messages)
     if subscription.sensor is None:
         content[part] = own

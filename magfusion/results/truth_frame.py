@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.data_checks.truth import LEAST_TURN, SPAN
 from magfusion.results.association import AssociatedPoses
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -10,8 +11,6 @@ LEAST_ANGLE = 5.0 * DEGREE  # of a frame; surveys and calibrations do better
 CONVENTION = 15.0 * DEGREE  # from the axes of a convention
 LEVEL = 2.0 * DEGREE  # of the vertical of a world that is turned by yaw alone
 EXPLAINED = 0.3  # of the errors that a constant leaves
-SPAN = 0.5  # s; between two attitudes that are compared
-LEAST_TURN = 0.03  # rad in a span; a body that turns less does not show its axes
 MIN_TURNS = 10
 MIN_FLATNESS = 0.05  # second extent of a path over the first; along a line the roll is open
 FROZEN_MOVE, FROZEN_TURN = 0.1, 5.0 * DEGREE  # m, rad of the estimate; beyond its noise at rest

@@ -14,27 +14,13 @@ MARGIN = 10.0  # s, before and after
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """Gaussian noise of a density that falls with the frequency, common to all instruments.
+    """Gaussian noise of a density that falls with the frequency, common to all instruments."""
 
-    Parameters
-    ----------
-    density : float
-        One-sided, at 1 Hz (T/sqrt(Hz)), of each world component.
-    seed : int
-        Instruments with the same seed receive the same noise.
-    exponent : float
-        Power of the frequency with which the density falls.
-    duration : float
-        Length of the noise (s).
-    highest_hz : float
-        Upper cutoff frequency.
-    """
-
-    density: float
-    seed: int
-    duration: float
-    highest_hz: float
-    exponent: float = 0.5
+    density: float  # one-sided, at 1 Hz (T/sqrt(Hz)), of each world component
+    seed: int  # instruments with the same seed receive the same noise
+    duration: float  # length of the noise (s)
+    highest_hz: float  # upper cutoff frequency
+    exponent: float = 0.5  # power of the frequency with which the density falls
 
     def field_world(self, time: Array) -> Array:
         """Return the noise at times within its duration, shape (n, 3) (T)."""

@@ -19,19 +19,11 @@ MotionKind = Literal["walk", "turn", "static", "drive"]
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A second, stationary magnetometer that receives the same ambient noise.
+    """A second, stationary magnetometer that receives the same ambient noise."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,)
-        (m)
-    world_from_sensor : ndarray, shape (3, 3)
-    late, rate : float
-        A sample stamped t was taken at t + late + rate t (s).
-    """
-
-    position_world: Array
-    world_from_sensor: Array = field(default_factory=lambda: np.eye(3))
+    position_world: Array  # (3,) (m)
+    world_from_sensor: Array = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    # late, rate: a sample stamped t was taken at t + late + rate t (s)
     late: float = 0.0
     rate: float = 0.0
 

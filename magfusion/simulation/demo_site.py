@@ -32,12 +32,8 @@ DEMO_BOX_WORLD = np.array([[1.2, 1.2, 0.6], [4.8, 3.8, 1.6]])  # m, clear of the
 def demo_site(coil_radius: float | None = 0.1, synchronised: bool = True) -> Site:
     """Return four rotating beacons of two coils each, and a platform of ordinary MEMS quality.
 
-    Parameters
-    ----------
-    coil_radius : float, optional
-        Of the true coils (m); None makes them dipoles, so that the dipole model is exact.
-    synchronised : bool
-        Whether the drive phases are known.
+    `coil_radius`: of the true coils (m); None makes them dipoles, so that the dipole model is
+    exact. `synchronised`: whether the drive phases are known.
     """
     beacons = tuple(
         _beacon(name, position, rpy_deg, frequency_hz, coil_radius, synchronised)

@@ -23,24 +23,12 @@ _POINTS = 4096  # of which that many features are held at once
 
 @dataclass(frozen=True, eq=False)
 class Spheres:
-    """Permeable or conducting spheres, with an induced field at every tone.
+    """Permeable or conducting spheres, with an induced field at every tone."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    radius : ndarray, shape (n,)
-        (m)
-    permeability : ndarray, shape (n,)
-        Relative.
-    conductivity : ndarray, shape (n,)
-        (S/m)
-    """
-
-    position_world: Array
-    radius: Array
-    permeability: Array
-    conductivity: Array
+    position_world: Array  # (n, 3) (m)
+    radius: Array  # (n,) (m)
+    permeability: Array  # (n,), relative
+    conductivity: Array  # (n,) (S/m)
 
     def __len__(self) -> int:
         return len(self.radius)
@@ -50,23 +38,9 @@ class Spheres:
     ) -> ComplexArray:
         """Return the phasors that the spheres add at points.
 
-        Parameters
-        ----------
-        primary_world : complex ndarray, shape (spheres, tones, 3)
-            At the spheres' centres (T).
-        frequencies_hz : ndarray, shape (tones,)
-        point_world : ndarray, shape (n, 3)
-            (m)
-
-        Returns
-        -------
-        complex ndarray, shape (n, tones, 3)
-            (T)
-
-        Raises
-        ------
-        InputError
-            If a point lies inside a sphere.
+        `primary_world` (spheres, tones, 3): at the spheres' centres (T). `frequencies_hz` (tones,),
+        `point_world` (n, 3) (m). Returns (n, tones, 3) (T). Raises InputError if a point lies
+        inside a sphere.
         """
         for k, (place, radius) in enumerate(zip(self.position_world, self.radius, strict=True)):
             square = np.sum((point_world - place) ** 2, axis=1)
@@ -98,25 +72,10 @@ def draw_spheres(
 
     The surface of each is at least `CLEARANCE` from the box and from every beacon's centre; its
     centre is drawn uniformly from the box enlarged by its radius, `CLEARANCE` and ``reach`` on all
-    sides.
-
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of the body's range.
-    beacons_world : ndarray, shape (beacons, 3)
-        (m)
-    radius_range : tuple of float
-        Radii are drawn uniformly between these (m).
-    permeability, conductivity : float
-        Of all spheres (relative; S/m).
-    reach : float
-        (m)
-
-    Raises
-    ------
-    InputError
-        If so many do not fit.
+    sides. `box_world` (2, 3): lower and upper corner (m) of the body's range.
+    `beacons_world` (beacons, 3) (m). `radius_range`: radii are drawn uniformly between these (m).
+    `permeability`, `conductivity`: of all spheres (relative; S/m). `reach` (m). Raises InputError
+    if so many do not fit.
     """
     radius = rng.uniform(*radius_range, count)
     position_world = np.zeros((count, 3))
@@ -152,16 +111,10 @@ class SmoothField:
 
     Sums of waves with random vectors and amplitudes (random Fourier features): for any two places
     at distance d the covariance is ``rms^2 exp(-d^2 / (2 length^2))`` in the mean over draws.
-
-    Parameters
-    ----------
-    wave : ndarray, shape (features, dimension)
-        Wave vectors (rad per unit).
-    cosine, sine : ndarray, shape (features, functions)
-        Amplitudes.
     """
 
-    wave: Array
+    wave: Array  # (features, dimension), wave vectors (rad per unit)
+    # cosine, sine: (features, functions), amplitudes
     cosine: Array
     sine: Array
 
@@ -176,12 +129,8 @@ def draw_smooth(
 ) -> SmoothField:
     """Return independent random functions.
 
-    Parameters
-    ----------
-    rms : float
-        Of each function's value at a place, over draws.
-    length : float
-        Of correlation, in the unit of the places.
+    `rms`: of each function's value at a place, over draws. `length`: of correlation, in the unit of
+    the places.
     """
     wave = rng.standard_normal((_FEATURES, dimension)) / length
     amplitude = rng.standard_normal((2, _FEATURES, functions)) * rms / np.sqrt(_FEATURES)
@@ -190,14 +139,9 @@ def draw_smooth(
 
 @dataclass(frozen=True, eq=False)
 class Bending:
-    """A smooth random 3 x 3 matrix per beacon and position, added to unity.
+    """A smooth random 3 x 3 matrix per beacon and position, added to unity."""
 
-    Parameters
-    ----------
-    matrix : SmoothField
-        Of place (m), world axes; nine functions a beacon, the matrix's rows one after the other.
-    """
-
+    # of place (m), world axes; nine functions a beacon, the matrix's rows one after the other
     matrix: SmoothField
 
     def bent_world(self, beacon: int, phasors_world: ComplexArray, point_world: Array) -> AnyArray:
@@ -215,31 +159,19 @@ class Bending:
 def draw_bending(rng: np.random.Generator, rms: float, length: float, beacons: int) -> Bending:
     """Return a random bending.
 
-    Parameters
-    ----------
-    rms : float
-        Deviation relative to the field's magnitude.
-    length : float
-        Correlation length (m).
+    `rms`: deviation relative to the field's magnitude. `length`: correlation length (m).
     """
     return Bending(draw_smooth(rng, rms / np.sqrt(3.0), length, 9 * beacons))
 
 
 @dataclass(frozen=True)
 class DayNight:
-    """White ambient noise, weak at night and strong by day, along a cosine.
+    """White ambient noise, weak at night and strong by day, along a cosine."""
 
-    Parameters
-    ----------
-    night, day : float
-        Minimum and maximum one-sided density (T/sqrt(Hz)).
-    noisiest_time : float
-        Time of the maximum, seconds since the log's epoch; once a day.
-    """
-
+    # night, day: minimum and maximum one-sided density (T/sqrt(Hz))
     night: float
     day: float
-    noisiest_time: float = 0.0
+    noisiest_time: float = 0.0  # time of the maximum, seconds since the log's epoch; once a day
 
     def density(self, time: Array) -> Array:
         """Return the one-sided density (T/sqrt(Hz)) at the times, shape (n,)."""
@@ -258,18 +190,10 @@ def office_noise(epoch_ns: int) -> DayNight:
 
 @dataclass(frozen=True)
 class FieldDrift:
-    """Slow, smooth, random change of the field at rest.
+    """Slow, smooth, random change of the field at rest."""
 
-    Parameters
-    ----------
-    rms : float
-        Of each world component (T).
-    time : float
-        Of correlation (s).
-    """
-
-    rms: float
-    time: float
+    rms: float  # of each world component (T)
+    time: float  # of correlation (s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,15 +211,7 @@ class Ambient:
     def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
         """Return noise and drift at the samples of an instrument.
 
-        Parameters
-        ----------
-        time : ndarray, shape (n,)
-            (s)
-
-        Returns
-        -------
-        ndarray, shape (n, 3)
-            (T)
+        `time` (n,) (s). Returns (n, 3) (T).
         """
         field_world = np.zeros((len(time), 3))
         if self.day_night is not None:

@@ -17,18 +17,10 @@ COPPER_PER_KELVIN = 3.9e-3  # relative rise of resistance
 
 @dataclass(frozen=True)
 class WarmUp:
-    """A body with one thermal time constant, heated uniformly since the log's epoch.
+    """A body with one thermal time constant, heated uniformly since the log's epoch."""
 
-    Parameters
-    ----------
-    rise : float
-        Final temperature rise (K).
-    time_constant : float
-        (s)
-    """
-
-    rise: float
-    time_constant: float
+    rise: float  # final temperature rise (K)
+    time_constant: float  # (s)
 
     def temperature(self, time: Array) -> Array:
         """Return the temperature above that of the epoch (K) at times since then (s)."""
@@ -37,18 +29,10 @@ class WarmUp:
 
 @dataclass(frozen=True)
 class DailySwing:
-    """A daily temperature cycle along a cosine.
+    """A daily temperature cycle along a cosine."""
 
-    Parameters
-    ----------
-    amplitude : float
-        Half of the peak-to-peak value (K).
-    warmest_time : float
-        Seconds since the log's epoch; once a day.
-    """
-
-    amplitude: float
-    warmest_time: float = 0.0
+    amplitude: float  # half of the peak-to-peak value (K)
+    warmest_time: float = 0.0  # seconds since the log's epoch; once a day
 
     def temperature(self, time: Array) -> Array:
         """Return the temperature above the day's mean (K) at times (s)."""
@@ -58,30 +42,15 @@ class DailySwing:
 
 @dataclass(frozen=True)
 class Wander:
-    """A random change that stays bounded (Ornstein-Uhlenbeck), stationary from the start.
+    """A random change that stays bounded (Ornstein-Uhlenbeck), stationary from the start."""
 
-    Parameters
-    ----------
-    rms : float
-        In the unit of the process.
-    time_constant : float
-        Time after which the correlation is 1/e (s).
-    """
-
-    rms: float
-    time_constant: float
+    rms: float  # in the unit of the process
+    time_constant: float  # time after which the correlation is 1/e (s)
 
     def draw(self, time: Array, functions: int, rng: np.random.Generator) -> Array:
         """Return independent paths, exact at any spacing of the times.
 
-        Parameters
-        ----------
-        time : ndarray, shape (n,)
-            Increasing (s).
-
-        Returns
-        -------
-        ndarray, shape (n, functions)
+        `time` (n,): increasing (s). Returns (n, functions).
         """
         path = rng.normal(0.0, self.rms, (len(time), functions))
         kept = np.exp(-np.diff(time) / self.time_constant)
@@ -93,33 +62,20 @@ class Wander:
 
 @dataclass(frozen=True)
 class DriveClock:
-    """The clock of the drives relative to that of the log; both agree at the log's epoch.
+    """The clock of the drives relative to that of the log; both agree at the log's epoch."""
 
-    Parameters
-    ----------
-    rate : float
-        Relative error of its frequency, constant; positive for one that runs fast, as
-        `magfusion.simulation.field.Drives.drift`.
-    walk : float
-        White frequency noise, which makes its lead a random walk (s per root second): the Allan
-        deviation at one second.
-    """
-
+    # relative error of its frequency, constant; positive for one that runs fast, as
+    # `magfusion.simulation.field.Drives.drift`
     rate: float = 0.0
+    # white frequency noise, which makes its lead a random walk (s per root second): the Allan
+    # deviation at one second
     walk: float = 0.0
 
     def lead(self, time: Array, rng: np.random.Generator) -> Array:
         """Return the lead of the drives' clock (s), shape (n,).
 
-        Parameters
-        ----------
-        time : ndarray, shape (n,)
-            Seconds since the log's epoch, increasing.
-
-        Raises
-        ------
-        ValueError
-            Where time decreases, or starts before the epoch.
+        `time` (n,): seconds since the log's epoch, increasing. Raises ValueError where time
+        decreases, or starts before the epoch.
         """
         elapsed = np.diff(time, prepend=0.0)
         if np.any(elapsed < 0.0):
@@ -130,50 +86,28 @@ class DriveClock:
 
 @dataclass(frozen=True)
 class Drift:
-    """Drift of a run; None where absent.
+    """Drift of a run; None where absent."""
 
-    Parameters
-    ----------
-    coils : WarmUp, optional
-        Temperature of all coils and their amplifiers, which are driven equally.
-    fading_per_kelvin : float
-        The moment of a coil warmer by T kelvin is scaled by ``1 / (1 + fading T)``: for a constant
-        voltage `COPPER_PER_KELVIN`, for a constant current the loss of its source.
-    gain : Wander, optional
-        Of the logarithm of each beacon's moment, independent between beacons.
-    clock : DriveClock, optional
-        One for all drives, as of a common generator.
-    sensor : DailySwing, optional
-        Temperature of the magnetometer.
-    scale_per_kelvin : float
-        Relative rise of the magnetometer's scale.
-    """
-
+    # temperature of all coils and their amplifiers, which are driven equally
     coils: WarmUp | None = None
+    # the moment of a coil warmer by T kelvin is scaled by ``1 / (1 + fading T)``: for a constant
+    # voltage `COPPER_PER_KELVIN`, for a constant current the loss of its source
     fading_per_kelvin: float = 0.0
+    # of the logarithm of each beacon's moment, independent between beacons
     gain: Wander | None = None
-    clock: DriveClock | None = None
-    sensor: DailySwing | None = None
-    scale_per_kelvin: float = 0.0
+    clock: DriveClock | None = None  # one for all drives, as of a common generator
+    sensor: DailySwing | None = None  # temperature of the magnetometer
+    scale_per_kelvin: float = 0.0  # relative rise of the magnetometer's scale
 
 
 @dataclass(frozen=True, eq=False)
 class DriftSeries:
-    """One draw of a `Drift`.
+    """One draw of a `Drift`."""
 
-    Parameters
-    ----------
-    log_gain : ndarray, shape (n, beacons)
-        Natural logarithm of each beacon's moment, relative to the declared.
-    lead : ndarray, shape (n,)
-        Of the drives' clock relative to the log's (s).
-    sensor_scale : ndarray, shape (n,)
-        Of the magnetometer's output, relative to the declared.
-    """
-
+    # (n, beacons), natural logarithm of each beacon's moment, relative to the declared
     log_gain: Array
-    lead: Array
-    sensor_scale: Array
+    lead: Array  # (n,), of the drives' clock relative to the log's (s)
+    sensor_scale: Array  # (n,), of the magnetometer's output, relative to the declared
 
     def phase(self, frequencies_hz: Array) -> Array:
         """Return the drive phase in addition to the declared (rad), shape (n, tones)."""
@@ -183,12 +117,7 @@ class DriftSeries:
 def draw_drift(drift: Drift, time: Array, beacons: int, rng: np.random.Generator) -> DriftSeries:
     """Draw a realisation of a drift.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, increasing.
-    Gains and clock have separate generators, spawned from it, so that runs that differ in one
-    of them share the other.
+    `time` (n,): seconds since the log's epoch, increasing.
     """
     gain_rng, clock_rng = rng.spawn(2)
     log_gain = np.zeros((len(time), beacons))

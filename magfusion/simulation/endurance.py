@@ -42,12 +42,8 @@ _WORLD, _IMU, _FIELDS = range(3)  # first key of each stream of random numbers
 def usual_drift(drive: str, clock_rate: float) -> Drift:
     """Return drifts of the moments, their gain, a common drive clock, and the sensor's scale.
 
-    Parameters
-    ----------
-    drive : {'current', 'voltage'}
-        A constant voltage drives less current through warmer copper.
-    clock_rate : float
-        Relative error of the drives' common clock.
+    `drive`: 'current' or 'voltage': a constant voltage drives less current through warmer copper.
+    `clock_rate`: relative error of the drives' common clock.
     """
     return Drift(
         coils=HEAT,
@@ -61,40 +57,24 @@ def usual_drift(drive: str, clock_rate: float) -> Drift:
 
 @dataclass(frozen=True, eq=False)
 class EnduranceConfig:
-    """Configuration of a run of hours.
-
-    Parameters
-    ----------
-    drift : Drift
-        Of moments and sensor, and of the clock common to all drives; beacons that are not
-        synchronised also drift relative to it, each at a rate of its own.
-    schedule : Rests
-        Walks, and the rests between them.
-    box_world : ndarray, shape (2, 3)
-        Range of the platform (m).
-    speed : float
-        (m/s)
-    instability : BiasInstability, optional
-        Of the IMU, in addition to its bias walk.
-    noise : DayNight
-        Of the field.
-    window : float
-        Of a phasor (s).
-    rest_interval, walk_interval : float
-        Between two phasors (s).
-    """
+    """Configuration of a run of hours."""
 
     hours: float
+    # of moments and sensor, and of the clock common to all drives; beacons that are not
+    # synchronised also drift relative to it, each at a rate of its own
     drift: Drift = field(default_factory=lambda: usual_drift("current", 0.0))
-    schedule: Rests = SCHEDULE
+    schedule: Rests = SCHEDULE  # walks, and the rests between them
+    # (2, 3), range of the platform (m)
     box_world: Array = field(default_factory=lambda: DEMO_BOX_WORLD)
-    speed: float = 0.5
+    speed: float = 0.5  # (m/s)
     imu_rate_hz: float = 100.0
-    instability: BiasInstability | None = None
+    instability: BiasInstability | None = None  # of the IMU, in addition to its bias walk
+    # of the field
     noise: DayNight = field(
         default_factory=lambda: DayNight(0.2 * NANOTESLA, 0.4 * NANOTESLA, DAYTIME)
     )
-    window: float = 0.4
+    window: float = 0.4  # of a phasor (s)
+    # rest_interval, walk_interval: between two phasors (s)
     rest_interval: float = 60.0
     walk_interval: float = 1.0
 
@@ -134,50 +114,28 @@ class Biases:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStretch:
-    """Some minutes of samples and their true values.
+    """Some minutes of samples and their true values."""
 
-    Parameters
-    ----------
-    first : int
-        First block.
-    gyro_bias_body, accel_bias_body : ndarray, shape (n, 3)
-        At the inertial samples (rad/s, m/s^2).
-    after : Biases
-        Start of the next stretch.
-    """
-
-    first: int
+    first: int  # first block
     imu: ImuSamples
     fields: FieldSamples
+    # gyro_bias_body, accel_bias_body: (n, 3), at the inertial samples (rad/s, m/s^2)
     gyro_bias_body: Array
     accel_bias_body: Array
-    after: Biases
+    after: Biases  # start of the next stretch
 
 
 @dataclass(frozen=True, eq=False)
 class EnduranceWorld:
-    """One draw of all true values of a run; a few megabytes for 48 hours.
-
-    Parameters
-    ----------
-    site : Site
-        Known to the estimator.
-    log_gain : ndarray, shape (blocks + 1, beacons)
-        Of the moments, at the blocks' edges.
-    phase : ndarray, shape (blocks + 1, channels)
-        In addition to the declared (rad).
-    scale : ndarray, shape (blocks + 1,)
-        Of the magnetometer.
-    seed : tuple of int
-    """
+    """One draw of all true values of a run; a few megabytes for 48 hours."""
 
     config: EnduranceConfig
-    site: Site
+    site: Site  # known to the estimator
     true_site: Site
     motion: SimulatedMotion
-    log_gain: Array
-    phase: Array
-    scale: Array
+    log_gain: Array  # (blocks + 1, beacons), of the moments, at the blocks' edges
+    phase: Array  # (blocks + 1, channels), in addition to the declared (rad)
+    scale: Array  # (blocks + 1,), of the magnetometer
     seed: tuple[int, ...]
 
     def start(self) -> Biases:
@@ -191,12 +149,7 @@ class EnduranceWorld:
     def stretch(self, first: int, count: int, before: Biases) -> SimulatedStretch:
         """Return some blocks of samples.
 
-        Parameters
-        ----------
-        first, count : int
-            Blocks; no more than there are.
-        before : Biases
-            From the previous stretch.
+        `first`, `count`: blocks; no more than there are. `before`: from the previous stretch.
         """
         count = min(count, self.config.blocks - first)
         inertial, fields = [], []
@@ -303,16 +256,8 @@ class EnduranceWorld:
 def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -> EnduranceWorld:
     """Draw a world.
 
-    Parameters
-    ----------
-    site : Site
-        Known to the estimator; the true calibration is drawn from its sigmas.
-    seed : tuple of int
-
-    Raises
-    ------
-    InputError
-        If the site or the configuration cannot be simulated.
+    `site`: known to the estimator; the true calibration is drawn from its sigmas. Raises InputError
+    if the site or the configuration cannot be simulated.
     """
     site_rng, motion_rng, drift_rng, clock_rng = _generator(seed, _WORLD, 0).spawn(4)
     true_site = perturb_site(site, site_rng)

@@ -19,20 +19,11 @@ from magfusion.units import AnyArray, Array, ComplexArray
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """True drive of every beacon relative to the log clock, in addition to its coils' phases.
+    """True drive of every beacon relative to the log clock, in addition to its coils' phases."""
 
-    Parameters
-    ----------
-    phase : ndarray, shape (tones,)
-        Of all beacons' tones, one after the other, at the log's epoch (rad).
-    drift : ndarray, shape (beacons,)
-        Relative frequency error.
-    turning : mapping of str to MagnetRotation
-        Of beacons that are magnets on shafts, by name; phase and drift do not apply to them.
-    """
-
-    phase: Array
-    drift: Array
+    phase: Array  # (tones,), of all beacons' tones, one after the other, at the log's epoch (rad)
+    drift: Array  # (beacons,), relative frequency error
+    # of beacons that are magnets on shafts, by name; phase and drift do not apply to them
     turning: Mapping[str, MagnetRotation] = field(default_factory=dict)
 
 
@@ -46,16 +37,7 @@ def coil_field(offset: Array, coil: Coil) -> Array:
     """Return the flux density of a coil at its peak current, in the axes of its arguments.
 
     See `magfusion.model.physics.solenoid.solenoid_field` for the shapes and their accuracy.
-
-    Parameters
-    ----------
-    offset : ndarray, shape (n, 3)
-        From the beacon's origin (m).
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        (T)
+    `offset` (n, 3): from the beacon's origin (m). Returns (n, 3) (T).
     """
     return solenoid_field(offset - coil.centre_beacon, coil.moment_beacon, coil.radius, coil.length)
 

@@ -25,19 +25,8 @@ def dipole_in_ground(
 ) -> ComplexArray:
     """Return the phasor of a dipole in a conducting full space.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (n, 3)
-        From the dipole (m).
-    moment : ndarray, shape (3,)
-        (A m^2)
-    conductivity : float
-        (S/m)
-
-    Returns
-    -------
-    complex ndarray, shape (n, 3)
-        (T), for ``exp(+j w t)``.
+    `offset` (n, 3): from the dipole (m). `moment` (3,) (A m^2), `conductivity` (S/m). Returns
+    (n, 3) (T), for ``exp(+j w t)``.
     """
     size, distance = np.linalg.norm(moment), np.linalg.norm(offset, axis=1)[:, None]
     axis, outward = moment / size, offset / distance
@@ -56,15 +45,8 @@ def ground_effect(
 ) -> ComplexArray:
     """Return the contribution of conduction to the field of a coil at its peak current.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (n, 3)
-        From the coil's magnetic centre (m).
-
-    Returns
-    -------
-    complex ndarray, shape (n, 3)
-        (T), in the axes of its arguments.
+    `offset` (n, 3): from the coil's magnetic centre (m). Returns (n, 3) (T), in the axes of its
+    arguments.
     """
     total = np.zeros(offset.shape, dtype=np.complex128)
     for place, share in _parts(coil):

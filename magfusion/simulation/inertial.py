@@ -19,21 +19,11 @@ _PEAK_TIME = 1.89
 
 @dataclass(frozen=True)
 class BiasInstability:
-    """The flat part of an Allan deviation plot, as a first-order Gauss-Markov process.
+    """The flat part of an Allan deviation plot, as a first-order Gauss-Markov process."""
 
-    Parameters
-    ----------
-    gyro : float
-        Largest Allan deviation of the process (rad/s).
-    accel : float
-        The same of the accelerometer (m/s^2).
-    time : float
-        Averaging time at which it is largest (s).
-    """
-
-    gyro: float
-    accel: float
-    time: float
+    gyro: float  # largest Allan deviation of the process (rad/s)
+    accel: float  # the same of the accelerometer (m/s^2)
+    time: float  # averaging time at which it is largest (s)
 
     @property
     def sigma(self) -> Array:

@@ -25,18 +25,10 @@ THINNEST = 1e-3  # m; of the box about the platform
 
 @dataclass(frozen=True)
 class Layers:
-    """Ground by layers, air above.
+    """Ground by layers, air above."""
 
-    Parameters
-    ----------
-    top : tuple of float
-        Height of the upper side of each (m), from above.
-    conductivity : tuple of float
-        Of each (S/m).
-    """
-
-    top: tuple[float, ...]
-    conductivity: tuple[float, ...]
+    top: tuple[float, ...]  # height of the upper side of each (m), from above
+    conductivity: tuple[float, ...]  # of each (S/m)
 
     def of(self, height: Array | float) -> IntArray:
         """Return the index of the layer at each height, zero for air."""
@@ -45,12 +37,7 @@ class Layers:
 
 
 def layers_option(text: str) -> Layers:
-    """Parse ``height:conductivity`` of each layer, from above, separated by commas.
-
-    Raises
-    ------
-    InputError
-    """
+    """Parse ``height:conductivity`` of each layer, from above, separated by commas."""
     try:
         pairs = [tuple(float(number) for number in part.split(":")) for part in text.split(",")]
         top, conductivity = zip(*((height, value) for height, value in pairs), strict=True)
@@ -68,23 +55,9 @@ def layers_option(text: str) -> Layers:
 def layered_effect(beacon: Beacon, point_world: Array, layers: Layers) -> ComplexArray:
     """Return the contribution of layered ground to the field of each coil at its peak current.
 
-    The coil is approximated by a dipole.
-
-    Parameters
-    ----------
-    point_world : ndarray, shape (n, 3)
-        All in one layer (m).
-
-    Returns
-    -------
-    complex ndarray, shape (n, coils, 3)
-        World axes (T).
-
-    Raises
-    ------
-    InputError
-        Where empymod is not installed, the platform passes from one layer to another, or comes too
-        close to a beacon for a polynomial.
+    The coil is approximated by a dipole. `point_world` (n, 3): all in one layer (m). Returns
+    (n, coils, 3): world axes (T). Raises InputError where empymod is not installed, the platform
+    passes from one layer to another, or comes too close to a beacon for a polynomial.
     """
     low, high = np.min(point_world, axis=0), np.max(point_world, axis=0)
     if layers.of(low[2]) != layers.of(high[2]):
@@ -156,10 +129,7 @@ def layered_effect_at(
 ) -> ComplexArray:
     """Return the ground's contribution to a dipole's field at one height, shape (n, 3).
 
-    Parameters
-    ----------
-    point_world : ndarray, shape (n, 3)
-        (m); the height is that of the first.
+    `point_world` (n, 3) (m); the height is that of the first.
     """
     x, y = point_world[:, 0], point_world[:, 1]
     height = float(point_world[0, 2])

@@ -11,7 +11,7 @@ from magfusion.model.arguments import check_arguments
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.short_repr import short_repr
-from magfusion.model.site import Site
+from magfusion.model.site import MarkedSlots, Site
 from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.simulation.aiding import simulate_aiding
 from magfusion.simulation.config import Reference as Reference
@@ -32,7 +32,7 @@ from magfusion.simulation.motion import (
 from magfusion.simulation.perturbed import perturb_site as perturb_site
 from magfusion.simulation.perturbed import with_earth_field
 from magfusion.simulation.rotor_beacons import MagnetRotation, recorded_angles, turn_rotors
-from magfusion.simulation.slots import draw_marks, is_multiplexed
+from magfusion.simulation.slots import draw_marks
 from magfusion.simulation.waveform import beacons_world, simulate_waveform
 from magfusion.units import Array
 
@@ -43,29 +43,15 @@ TURN_STEP = 0.6  # rad rms between two knots of a turn, at most: more than pi is
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLog:
-    """A log and its true values.
-
-    Parameters
-    ----------
-    log : Log
-        Its truth is stamped on the log's clock at the IMU's rate.
-    true_site : Site
-        True calibration, noise and time offset of the IMU.
-    drives : Drives
-        True phases and drifts.
-    motion : SimulatedMotion
-        Exact truth at any time.
-    ambient : Ambient, optional
-        With the drawn iron.
-    """
+    """A log and its true values."""
 
     __repr__ = short_repr
 
-    log: Log
-    true_site: Site
-    drives: Drives
-    motion: SimulatedMotion
-    ambient: Ambient | None = None
+    log: Log  # its truth is stamped on the log's clock at the IMU's rate
+    true_site: Site  # true calibration, noise and time offset of the IMU
+    drives: Drives  # true phases and drifts
+    motion: SimulatedMotion  # exact truth at any time
+    ambient: Ambient | None = None  # with the drawn iron
 
     @property
     def time_offset(self) -> float:
@@ -106,7 +92,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     ambient = _with_bending(true_site, config, field_rng, _with_iron(true_site, config, iron_rng))
     imu = _imu(motion, true_site, config, imu_rng)
     marks = None
-    if is_multiplexed(site):
+    if any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons):
         marks = draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
 
     def recorded(site: Site, rng: np.random.Generator, own: np.random.Generator | None) -> Waveform:

@@ -12,11 +12,7 @@ def answered(
 ) -> ComplexArray:
     """Return the response of a magnetometer to tones, shape (n, tones, 3).
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, tones, 3)
-        As measured with a flat response (T).
-    frequency_hz : ndarray, shape (tones,)
+    `phasor` (n, tones, 3): as measured with a flat response (T). `frequency_hz` (tones,).
     """
     if response is None:
         return phasor

@@ -75,15 +75,9 @@ def run_many(
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Processes that persist over several calls, so that they are started once.
+    """Processes that persist over several calls, so that they are started once."""
 
-    Parameters
-    ----------
-    executor : Executor, optional
-        None runs the tasks in this process.
-    """
-
-    executor: Executor | None
+    executor: Executor | None  # None runs the tasks in this process
 
     def run(
         self,
@@ -108,17 +102,8 @@ def worker_pool(
 ) -> Iterator[WorkerPool]:
     """Yield an executor of tasks: this process, others of this machine, or a Dask cluster.
 
-    Parameters
-    ----------
-    maximum : int
-        Maximum number of concurrent tasks.
-    cluster, workers : str, int, optional
-        As of `run_many`.
-
-    Raises
-    ------
-    InputError
-        Where the cluster cannot be used, or ``workers`` is below one.
+    `maximum`: maximum number of concurrent tasks. `cluster`, `workers`: as of `run_many`. Raises
+    InputError where the cluster cannot be used, or ``workers`` is below one.
     """
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be at least 1; got {workers}")

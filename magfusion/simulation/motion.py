@@ -32,20 +32,11 @@ class Rests:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedMotion:
-    """A motion, at rest before its start and after its end.
+    """A motion, at rest before its start and after its end."""
 
-    Parameters
-    ----------
-    position : BSpline
-        World position (m) over the path parameter.
-    attitude : RotationSpline
-        World from body over the path parameter.
-    rate : BPoly
-        Derivative of the path parameter by time, over time (s); twice continuously differentiable.
-    """
-
-    position: BSpline
-    attitude: RotationSpline
+    position: BSpline  # world position (m) over the path parameter
+    attitude: RotationSpline  # world from body over the path parameter
+    # derivative of the path parameter by time, over time (s); twice continuously differentiable
     rate: BPoly
 
     def _progress(self, time: Array) -> tuple[Array, Array, Array]:
@@ -147,19 +138,10 @@ def turning_motion(
 ) -> SimulatedMotion:
     """Return a rotation about all axes, as of a body rotated by hand for calibration.
 
-    Parameters
-    ----------
-    rng, duration, box_world, speed, rests
-        As in `random_walk_motion`.
-    rate_rms : float
-        Of the angular rate (rad/s), approximate.
-    interval : float
-        Of the knots of the attitude (s); a turn of more than pi between two is shortened.
-
-    Raises
-    ------
-    InputError
-        If the box, the duration or the speed is invalid.
+    `rng`, `duration`, `box_world`, `speed`, `rests`: as in `random_walk_motion`. `rate_rms`: of the
+    angular rate (rad/s), approximate. `interval`: of the knots of the attitude (s); a turn of more
+    than pi between two is shortened. Raises InputError if the box, the duration or the speed is
+    invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests(), interval)
     attitudes = [Rotation.random(rng=rng)]
@@ -178,15 +160,8 @@ def driving_motion(
 ) -> SimulatedMotion:
     """Return laps of a vehicle along the longer walls of a box: it drives along its x axis, level.
 
-    Parameters
-    ----------
-    rng, duration, box_world, speed, rests
-        As in `random_walk_motion`.
-
-    Raises
-    ------
-    InputError
-        If the box, the duration or the speed is invalid.
+    `rng`, `duration`, `box_world`, `speed`, `rests`: as in `random_walk_motion`. Raises InputError
+    if the box, the duration or the speed is invalid.
     """
     rate, moving, _ = _progress(duration, rests or Rests(pause=0.0, move=duration))
     box = _checked_box(box_world, speed)

@@ -25,29 +25,17 @@ STEEL_PERMEABILITY, STEEL_CONDUCTIVITY = 100.0, 5e6  # relative, S/m
 
 @dataclass(frozen=True, eq=False)
 class Pipe:
-    """A straight tube, or a bar or rail where its wall is as thick as its radius.
+    """A straight tube, or a bar or rail where its wall is as thick as its radius."""
 
-    Parameters
-    ----------
-    start_world, end_world : ndarray, shape (3,)
-        Ends of its axis (m).
-    radius, wall : float
-        Outside, and of the wall (m).
-    permeability : float
-        Relative.
-    conductivity : float
-        (S/m)
-    segment : float
-        Maximum length of a segment (m).
-    """
-
+    # start_world, end_world: (3,), ends of its axis (m)
     start_world: Array
     end_world: Array
+    # radius, wall: outside, and of the wall (m)
     radius: float
     wall: float
-    permeability: float = STEEL_PERMEABILITY
-    conductivity: float = STEEL_CONDUCTIVITY
-    segment: float = 0.25
+    permeability: float = STEEL_PERMEABILITY  # relative
+    conductivity: float = STEEL_CONDUCTIVITY  # (S/m)
+    segment: float = 0.25  # maximum length of a segment (m)
 
     @property
     def axis_world(self) -> Array:
@@ -133,17 +121,10 @@ def wall_transmission(pipe: Pipe, frequency_hz: float) -> Through:
 
 @dataclass(frozen=True, eq=False)
 class Steel:
-    """Interacting pipes.
-
-    Parameters
-    ----------
-    pipes : tuple of Pipe
-    about : int, optional
-        Index of the pipe around the sensor, which is on its axis.
-    """
+    """Interacting pipes."""
 
     pipes: tuple[Pipe, ...]
-    about: int | None = None
+    about: int | None = None  # index of the pipe around the sensor, which is on its axis
 
     def points_world(self) -> Array:
         """Return the middle of all segments (m), shape (n, 3)."""
@@ -158,14 +139,8 @@ class Steel:
     ) -> ComplexArray:
         """Return the field of sources at a sensor, steel included, shape (k, 3) (T).
 
-        Parameters
-        ----------
-        at_segments_world : ndarray, shape (n, k, 3)
-            Field of k sources without steel at `points_world` (T).
-        at_point_world : ndarray, shape (k, 3)
-            At the sensor.
-        point_world : ndarray, shape (3,)
-            Of the sensor (m).
+        `at_segments_world` (n, k, 3): field of k sources without steel at `points_world` (T).
+        `at_point_world` (k, 3): at the sensor. `point_world` (3,): of the sensor (m).
         """
         moment = self.moments(at_segments_world, frequency_hz)
         field_world = at_point_world.astype(np.complex128)
@@ -188,10 +163,7 @@ class Steel:
     def moments(self, field_world: AnyArray, frequency_hz: float) -> ComplexArray:
         """Return the moment of each segment, shape (n, k, 3) (A m^2).
 
-        Parameters
-        ----------
-        field_world : ndarray, shape (n, k, 3)
-            Of k sources without steel at `points_world` (T).
+        `field_world` (n, k, 3): of k sources without steel at `points_world` (T).
         """
         points, rows = self.points_world(), self._rows()
         n = len(points)

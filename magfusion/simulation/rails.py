@@ -29,12 +29,7 @@ USAGE = (
 
 
 def rails_option(text: str) -> tuple[Pipe, ...]:
-    """Parse ``radius[/wall]:x,y,z:x,y,z`` of each (m), separated by semicolons.
-
-    Raises
-    ------
-    InputError
-    """
+    """Parse ``radius[/wall]:x,y,z:x,y,z`` of each (m), separated by semicolons."""
     return tuple(_pipe(part.strip(), text) for part in text.split(";"))
 
 
@@ -59,17 +54,9 @@ def _pipe(part: str, text: str) -> Pipe:
 def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Steel:
     """Return steel around a room, in segments that are short relative to every distance to it.
 
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of the body's range.
-    beacons_world : ndarray, shape (beacons, 3)
-        (m)
-
-    Raises
-    ------
-    InputError
-        If steel comes closer than `NEAREST` to the box or to a beacon, or crosses itself.
+    `box_world` (2, 3): lower and upper corner (m) of the body's range. `beacons_world` (beacons, 3)
+    (m). Raises InputError if steel comes closer than `NEAREST` to the box or to a beacon, or
+    crosses itself.
     """
     gaps = []
     for pipe in pipes:
@@ -83,10 +70,7 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
 def steel_along_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
     """Return steel near the paths (n, 3) (m) of a sensor and of a magnet, in short segments.
 
-    Raises
-    ------
-    InputError
-        If steel comes closer than `NEAREST` to a path, or crosses itself.
+    Raises InputError if steel comes closer than `NEAREST` to a path, or crosses itself.
     """
     gaps, ways = [], np.concatenate(ways_world)
     for pipe in pipes:
@@ -139,18 +123,8 @@ def secondary_world(
 ) -> ComplexArray:
     """Return the phasors of steel at points.
 
-    Parameters
-    ----------
-    at_segments_world : complex ndarray, shape (segments, tones, 3)
-        Without steel at `Steel.points_world` (T).
-    frequencies_hz : ndarray, shape (tones,)
-    point_world : ndarray, shape (n, 3)
-        (m)
-
-    Returns
-    -------
-    complex ndarray, shape (n, tones, 3)
-        (T)
+    `at_segments_world` (segments, tones, 3): without steel at `Steel.points_world` (T).
+    `frequencies_hz` (tones,), `point_world` (n, 3) (m). Returns (n, tones, 3) (T).
     """
     moments = np.stack(
         [

@@ -25,33 +25,15 @@ NODES_APART = 0.08  # of the distance, between places where steel and layers are
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """A pass of the magnet at a sensor at rest.
+    """A pass of the magnet at a sensor at rest."""
 
-    Parameters
-    ----------
-    sensor_depth : float
-        Along its own hole (m).
-    sensor_world : ndarray, shape (3,)
-        (m)
-    world_from_body : ndarray, shape (3, 3)
-        Of the sensor; its first axis is down the hole.
-    start_world : ndarray, shape (3,)
-        Of the magnet (m).
-    world_from_rotor : ndarray, shape (3, 3)
-        Its attitude, constant; it moves along its axis.
-    depth : tuple of float
-        Of the magnet along its hole when the pass begins and ends (m).
-    speed : float
-        Speed of the magnet along the hole (m/s).
-    """
-
-    sensor_depth: float
-    sensor_world: Array
-    world_from_body: Array
-    start_world: Array
-    world_from_rotor: Array
-    depth: tuple[float, float]
-    speed: float
+    sensor_depth: float  # along its own hole (m)
+    sensor_world: Array  # (3,) (m)
+    world_from_body: Array  # (3, 3), of the sensor; its first axis is down the hole
+    start_world: Array  # (3,), of the magnet (m)
+    world_from_rotor: Array  # (3, 3), its attitude, constant; it moves along its axis
+    depth: tuple[float, float]  # of the magnet along its hole when the pass begins and ends (m)
+    speed: float  # speed of the magnet along the hole (m/s)
 
     @property
     def duration(self) -> float:
@@ -81,13 +63,8 @@ def simulate_transits(
 ) -> Log:
     """Return a log of consecutive passes.
 
-    Parameters
-    ----------
-    site : Site
-        The true site: its only beacon is a rotor, whose position and attitude are those of the
-        passes.
-    encoder : bool
-        Whether the angle of the shaft is recorded.
+    `site`: the true site: its only beacon is a rotor, whose position and attitude are those of the
+    passes. `encoder`: whether the angle of the shaft is recorded.
     """
     beacon, begin = site.beacons[0], 0.0
     waves, angles, forces, depths, places = [], [], [], [], []
@@ -136,10 +113,7 @@ def passing_phasor(
 ) -> ComplexArray:
     """Return the once-per-turn phasor at the sensor, world axes, shape (n, 3) (T).
 
-    Parameters
-    ----------
-    depth : ndarray, shape (n,)
-        Of the magnet (m).
+    `depth` (n,): of the magnet (m).
     """
     rotor = site.beacons[0].rotor
     assert rotor is not None
@@ -205,10 +179,7 @@ def _added(
 ) -> ComplexArray | None:
     """Return the phasor of layers and steel at each sample, shape (n, 3) (T).
 
-    Parameters
-    ----------
-    share : complex ndarray, shape (3,)
-        Moment that alternates at the frequency, rotor axes (A m^2).
+    `share` (3,): moment that alternates at the frequency, rotor axes (A m^2).
     """
     if around.layers is None and around.steel is None and not around.conductivity:
         return None

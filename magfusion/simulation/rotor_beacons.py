@@ -17,21 +17,11 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class MagnetRotation:
-    """Rotation of a beacon's magnet.
+    """Rotation of a beacon's magnet."""
 
-    Parameters
-    ----------
-    angle : callable
-        Of the shaft (rad), of times (s).
-    steady_beacon : ndarray, shape (3,)
-        Static moment (A m^2).
-    encoder_sigma : float
-        (rad)
-    """
-
-    angle: Callable[[Array], Array]
-    steady_beacon: Array
-    encoder_sigma: float
+    angle: Callable[[Array], Array]  # of the shaft (rad), of times (s)
+    steady_beacon: Array  # (3,), static moment (A m^2)
+    encoder_sigma: float  # (rad)
 
 
 def turn_rotors(

@@ -19,58 +19,27 @@ LEAST_DRIFT_TIME = 1.0  # s
 
 @dataclass(frozen=True, eq=False)
 class Shaft:
-    """True rotation of a magnet, in addition to what its site declares.
+    """True rotation of a magnet, in addition to what its site declares."""
 
-    Parameters
-    ----------
-    angle_start : float
-        (rad)
-    drift_hz : float
-        Root mean square of the speed about its mean.
-    drift_time : float
-        Of correlation (s).
-    slip : float
-        Amplitude of the angle's error twice per turn, as of a bent joint (rad).
-    slip_phase : float
-        (rad)
-    whirl : float
-        Angle of the shaft's axis in backward whirl (rad).
-    length : float
-        Of the stack of magnets along the shaft (m).
-    encoder_sigma : float
-        Of a recorded angle (rad).
-    """
-
-    angle_start: float = 0.3
-    drift_hz: float = 0.05
-    drift_time: float = 20.0
-    slip: float = 0.0
-    slip_phase: float = 0.0
-    whirl: float = 0.0
-    length: float = 0.3
-    encoder_sigma: float = 2e-3
+    angle_start: float = 0.3  # (rad)
+    drift_hz: float = 0.05  # root mean square of the speed about its mean
+    drift_time: float = 20.0  # of correlation (s)
+    slip: float = 0.0  # amplitude of the angle's error twice per turn, as of a bent joint (rad)
+    slip_phase: float = 0.0  # (rad)
+    whirl: float = 0.0  # angle of the shaft's axis in backward whirl (rad)
+    length: float = 0.3  # of the stack of magnets along the shaft (m)
+    encoder_sigma: float = 2e-3  # of a recorded angle (rad)
 
 
 @dataclass(frozen=True)
 class ShaftErrors:
-    """Rotation errors of shafts in addition to the declared, and their record.
+    """Rotation errors of shafts in addition to the declared, and their record."""
 
-    Parameters
-    ----------
-    drift_hz : float, optional
-        Root mean square of the speed about its mean; by default the rotor's ``speed_sigma_hz``.
-    whirl : float
-        (rad)
-    encoder : bool
-        Whether angles are recorded.
-    encoder_sigma : float
-        (rad)
-    """
-
+    # root mean square of the speed about its mean; by default the rotor's ``speed_sigma_hz``
     drift_hz: float | None = None
-    whirl: float = 0.0
-    encoder: bool = True
-    encoder_sigma: float = 2e-3
+    whirl: float = 0.0  # (rad)
+    encoder: bool = True  # whether angles are recorded
+    encoder_sigma: float = 2e-3  # (rad)
 
 
 def draw_shaft(rotor: Rotor, errors: ShaftErrors, rng: np.random.Generator) -> Shaft:

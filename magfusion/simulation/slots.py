@@ -15,23 +15,10 @@ SHORTEST_PAUSE = 0.05  # of the longest
 
 @dataclass(frozen=True)
 class Multiplexer:
-    """A host that drives one coil after the other, with random pauses.
+    """A host that drives one coil after the other, with random pauses."""
 
-    Parameters
-    ----------
-    burst : float
-        Of each coil, and of the silence after the last (s).
-    pause : float
-        Maximum pause (s); each is drawn.
-    """
-
-    burst: float = 0.002
-    pause: float = 0.002
-
-
-def is_multiplexed(site: Site) -> bool:
-    """Return whether bursts of the site's coils are not clocked."""
-    return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
+    burst: float = 0.002  # of each coil, and of the silence after the last (s)
+    pause: float = 0.002  # maximum pause (s); each is drawn
 
 
 def draw_marks(
@@ -48,12 +35,7 @@ def draw_marks(
 
 
 def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> None:
-    """Raise an error for time slots that no schedule drives, or that are too short for the samples.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for slots that no schedule drives, or that are too short for the samples."""
     if all(slot is None for _, slot in beacon.tones):
         return
     slots = beacon.slots

@@ -34,25 +34,14 @@ MAX_ELEMENTS = 4000
 
 
 class Elements(NamedTuple):
-    """Scalar moments of a body.
+    """Scalar moments of a body."""
 
-    Parameters
-    ----------
-    centre_world, axis_world : ndarray, shape (n, 3)
-        (m), and the moment's direction, a unit vector.
-    length : ndarray, shape (n,)
-        Between the poles of a stick, zero for a point (m).
-    pole : ndarray, shape (n,)
-        Radius over which a pole of a stick is spread (m).
-    group : int ndarray, shape (n,)
-        Points of one group do not affect each other; negative for none.
-    """
-
+    # centre_world, axis_world: (n, 3) (m), and the moment's direction, a unit vector
     centre_world: Array
     axis_world: Array
-    length: Array
-    pole: Array
-    group: IntArray
+    length: Array  # (n,), between the poles of a stick, zero for a point (m)
+    pole: Array  # (n,), radius over which a pole of a stick is spread (m)
+    group: IntArray  # (n,), points of one group do not affect each other; negative for none
 
 
 class Body(Protocol):
@@ -69,24 +58,12 @@ class Body(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """A sphere; see `magfusion.model.physics.disturbance.sphere_polarizability`.
+    """A sphere; see `magfusion.model.physics.disturbance.sphere_polarizability`."""
 
-    Parameters
-    ----------
-    centre_world : ndarray, shape (3,)
-        (m)
-    radius : float
-        (m)
-    permeability : float
-        Relative.
-    conductivity : float
-        (S/m)
-    """
-
-    centre_world: Array
-    radius: float
-    permeability: float = STEEL_PERMEABILITY
-    conductivity: float = STEEL_CONDUCTIVITY
+    centre_world: Array  # (3,) (m)
+    radius: float  # (m)
+    permeability: float = STEEL_PERMEABILITY  # relative
+    conductivity: float = STEEL_CONDUCTIVITY  # (S/m)
 
     def elements(self) -> Elements:
         """Return three points."""
@@ -134,28 +111,17 @@ class Sheet:
     """A flat rectangle: a net of sticks that carry flux and current, and the loops of that net.
 
     It is cut into tiles; a stick leads from the middle of one to the next.
-
-    Parameters
-    ----------
-    corner_world, first_world, second_world : ndarray, shape (3,)
-        A corner, and the sides from it, at right angles (m).
-    thickness : float
-        (m)
-    permeability : float
-        Relative.
-    conductivity : float
-        (S/m)
-    tile : float
-        Maximum side of a tile (m).
     """
 
+    # corner_world, first_world, second_world: (3,), a corner, and the sides from it, at right
+    # angles (m)
     corner_world: Array
     first_world: Array
     second_world: Array
-    thickness: float
-    permeability: float = STEEL_PERMEABILITY
-    conductivity: float = STEEL_CONDUCTIVITY
-    tile: float = 0.25
+    thickness: float  # (m)
+    permeability: float = STEEL_PERMEABILITY  # relative
+    conductivity: float = STEEL_CONDUCTIVITY  # (S/m)
+    tile: float = 0.25  # maximum side of a tile (m)
 
     @cached_property
     def _grid(self) -> tuple[tuple[int, int], Array, Array]:
@@ -212,14 +178,7 @@ class Sheet:
 class SteelStructure:
     """Steel bodies that affect each other.
 
-    Parameters
-    ----------
-    bodies : tuple of Body
-
-    Raises
-    ------
-    InputError
-        If they have more than `MAX_ELEMENTS` elements.
+    Raises InputError if they have more than `MAX_ELEMENTS` elements.
     """
 
     bodies: tuple[Body, ...]
@@ -248,10 +207,7 @@ class SteelStructure:
     def moments(self, field_world: AnyArray, frequency_hz: float) -> ComplexArray:
         """Return the moment of each element, shape (n, k, 3) (A m^2).
 
-        Parameters
-        ----------
-        field_world : ndarray, shape (n, k, 3)
-            Of k sources without steel at `points_world` (T).
+        `field_world` (n, k, 3): of k sources without steel at `points_world` (T).
         """
         axis = self.elements.axis_world
         stiffness = block_diag(*(body.stiffness(frequency_hz) for body in self.bodies))

@@ -7,12 +7,11 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.steel_file import SteelEntry
-from magfusion.simulation.disturbance import draw_spheres
+from magfusion.simulation.disturbance import CLEARANCE, draw_spheres
 from magfusion.simulation.pipe import Pipe
 from magfusion.simulation.steel import Ball, Bar, Body, Sheet, SteelStructure
 from magfusion.units import Array
 
-CLEARANCE = 0.5  # m from the body's range to steel
 BEACON_CLEARANCE = 0.4  # m
 BODY_CLEARANCE = 0.1  # m from one piece to the next
 AROUND = 1.0  # m beyond the beacons and the body's range: where steel is placed
@@ -64,19 +63,9 @@ def draw_steel(
 ) -> SteelStructure:
     """Return the steel of a random room.
 
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    box_world : ndarray, shape (2, 3)
-        Lower and upper corner of the body's range (m), which no piece enters.
-    beacons_world : ndarray, shape (beacons, 3)
-        (m)
-
-    Raises
-    ------
-    InputError
-        If the pieces do not fit.
+    `kind`: one of `KINDS`. `box_world` (2, 3): lower and upper corner of the body's range (m),
+    which no piece enters. `beacons_world` (beacons, 3) (m). Raises InputError if the pieces do not
+    fit.
     """
     if kind == "spheres":
         return _spheres(rng, box_world, beacons_world)
@@ -104,10 +93,8 @@ def structure_of(entry: SteelEntry) -> SteelStructure:
 def check_clear(steel: SteelStructure, box_world: Array, beacons_world: Array, source: str) -> None:
     """Refuse elements of steel too close for their moments to be dipoles.
 
-    Raises
-    ------
-    InputError
-        If the middle of one is nearer than `NEAREST` to the body's range or to a beacon.
+    Raises InputError if the middle of one is nearer than `NEAREST` to the body's range or to a
+    beacon.
     """
     points = steel.points_world()
     to_box = np.linalg.norm(points - np.clip(points, *box_world), axis=1)

@@ -29,30 +29,19 @@ def _vertical() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Mains:
-    """Hum of power lines, uniform over the room.
+    """Hum of power lines, uniform over the room."""
 
-    Parameters
-    ----------
-    amplitude : float
-        Of the fundamental (T).
-    harmonics : tuple of float
-        Amplitude of the second, third, ... harmonic relative to the fundamental.
-    direction_world : ndarray, shape (3,)
-    """
-
-    amplitude: float
+    amplitude: float  # of the fundamental (T)
     frequency_hz: float = 50.0
+    # amplitude of the second, third, ... harmonic relative to the fundamental
     harmonics: tuple[float, ...] = (0.1, 0.3)
-    direction_world: Array = field(default_factory=_vertical)
+    direction_world: Array = field(default_factory=_vertical)  # (3,)
 
 
 def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
     """Return a sampling rate suitable for the fastest tone and the shortest time slot (Hz).
 
-    Parameters
-    ----------
-    burst : float
-        Length of an unclocked slot (s).
+    `burst`: length of an unclocked slot (s).
     """
     least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
     lengths = [

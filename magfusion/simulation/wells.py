@@ -18,42 +18,21 @@ class TwoWells:
     """Geometry of two wells.
 
     The sensor's well leads east, its depth counted from the world's origin.
-
-    Parameters
-    ----------
-    distance : float
-        Approximate distance between them (m).
-    direction : float
-        Of the magnet's well, from the high side, clockwise looking down the hole (rad).
-    dip : float
-        Of the sensor's well below the horizontal (rad).
-    lean : tuple of float
-        Of the magnet's well relative to the sensor's: rotation about the left, and about the high
-        side (rad).
-    turn : float
-        Of the magnet's angle zero about its shaft (rad).
-    ahead : float
-        Of the magnet's position at ``depth`` (m).
-    well_distance : float
-        Between the sensor's two places along its well (m).
-    reach : float
-        Of the magnet's path on either side of the sensor (m).
-    speed : float
-        Of the magnet along its well (m/s).
-    depth : float
-        Measured in both wells, in the middle (m).
     """
 
-    distance: float
+    distance: float  # approximate distance between them (m)
+    # of the magnet's well, from the high side, clockwise looking down the hole (rad)
     direction: float
-    dip: float
+    dip: float  # of the sensor's well below the horizontal (rad)
+    # of the magnet's well relative to the sensor's: rotation about the left, and about the high
+    # side (rad)
     lean: tuple[float, float]
-    turn: float
-    ahead: float
-    well_distance: float
-    reach: float
-    speed: float
-    depth: float = 0.0
+    turn: float  # of the magnet's angle zero about its shaft (rad)
+    ahead: float  # of the magnet's position at ``depth`` (m)
+    well_distance: float  # between the sensor's two places along its well (m)
+    reach: float  # of the magnet's path on either side of the sensor (m)
+    speed: float  # of the magnet along its well (m/s)
+    depth: float = 0.0  # measured in both wells, in the middle (m)
 
     @property
     def side_world(self) -> Array:
@@ -72,14 +51,9 @@ class TwoWells:
     ) -> tuple[Pass, ...]:
         """Return a pass for each of two places of the sensor.
 
-        Parameters
-        ----------
-        rolls : ndarray, shape (2,)
-            Of the sensor about its hole (rad).
-        axis_beacon : ndarray, shape (3,), optional
-            Of the shaft, down its hole; the first.
-        lever_body : ndarray, shape (3,), optional
-            Of the sensor in its body, which is on the axis of its hole (m).
+        `rolls` (2,): of the sensor about its hole (rad). `axis_beacon` (3,): of the shaft, down its
+        hole; the first. `lever_body` (3,): of the sensor in its body, which is on the axis of its
+        hole (m).
         """
         side = self.side_world
         across = side @ np.array([0.0, -np.sin(self.direction), np.cos(self.direction)])
@@ -116,16 +90,8 @@ class TwoWells:
     ) -> Pipe:
         """Return the casing around the sensor.
 
-        Parameters
-        ----------
-        half : float
-            Half length from the middle between its places (m).
-        radius : float
-            Outside (m).
-        steel : tuple of float
-            Its wall (m), permeability and conductivity (S/m).
-        segment : float
-            (m)
+        `half`: half length from the middle between its places (m). `radius`: outside (m). `steel`:
+        its wall (m), permeability and conductivity (S/m). `segment` (m).
         """
         down = self.side_world[:, 0]
         return Pipe(-half * down, half * down, radius, *steel, segment)

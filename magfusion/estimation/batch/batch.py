@@ -32,9 +32,7 @@ from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.posterior.convergence import last_move, refuse_open
 from magfusion.estimation.posterior.marginals import marginals
-from magfusion.estimation.posterior.noise_tuning import (
-    Tuned,
-)
+from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.estimation.snapshot.survey_error import survey_response
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.estimation.solve.memory import give_back_memory
@@ -266,10 +264,7 @@ def _solved(
 def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smoothed:
     """Return a posterior with other measurements of the same states, started from the solution.
 
-    Raises
-    ------
-    RuntimeError
-        From GTSAM, where these measurements leave the system singular.
+    Raises RuntimeError from GTSAM, where these measurements leave the system singular.
     """
     graph = replace(result.graph, measurements=measurements)
     estimate = optimise(graph, result.estimate)
@@ -301,12 +296,7 @@ def posterior(
 ) -> Smoothed:
     """Return the posterior of a log from its optimised graph.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Phasors measured in the graph.
-    gaps : int
-        Number of intervals with a bridged gap.
+    `samples`: phasors measured in the graph. `gaps`: number of intervals with a bridged gap.
     """
     estimate = result.estimate
     states, response = read_states(estimate.values, log.states.time), None

@@ -51,30 +51,14 @@ STEPS, MIN_COST_DECREASE = 40, 1e-8  # of the refinement; relative decrease that
 
 
 class DetectedFields(NamedTuple):
-    """Phasors of one beacon along a trajectory.
+    """Phasors of one beacon along a trajectory."""
 
-    Parameters
-    ----------
-    alone : Calibration
-        Of this beacon alone; the magnetometer of the trajectory is assumed exact.
-    poses : Trajectory
-        At the epochs of its detection.
-    sensor_world : ndarray, shape (n, 3)
-        (m)
-    measured : ndarray, shape (n, tones, 6)
-        Real parts, then imaginary parts (T), measured axes.
-    phasor_world : complex ndarray, shape (n, tones, 3)
-        (T), world axes.
-    sqrt_information : ndarray, shape (n, tones, 6, 6)
-        Whitening (1/T).
-    """
-
-    alone: Calibration
-    poses: Trajectory
-    sensor_world: Array
-    measured: Array
-    phasor_world: ComplexArray
-    sqrt_information: Array
+    alone: Calibration  # of this beacon alone; the magnetometer of the trajectory is assumed exact
+    poses: Trajectory  # at the epochs of its detection
+    sensor_world: Array  # (n, 3) (m)
+    measured: Array  # (n, tones, 6), real parts, then imaginary parts (T), measured axes
+    phasor_world: ComplexArray  # (n, tones, 3) (T), world axes
+    sqrt_information: Array  # (n, tones, 6, 6), whitening (1/T)
 
     @property
     def beacon(self) -> Beacon:
@@ -105,17 +89,9 @@ def detected_along(
 ) -> DetectedFields:
     """Return a beacon's phasors with the poses at which they were measured.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of the trajectory; its magnetometer and its time offset are used.
-    windows_per_sample : float
-        Number of windows that contain each sample.
-
-    Raises
-    ------
-    EstimationError
-        Where it was detected at too few epochs.
+    `calibration`: of the trajectory; its magnetometer and its time offset are used.
+    `windows_per_sample`: number of windows that contain each sample. Raises EstimationError where
+    it was detected at too few epochs.
     """
     columns = np.array([name == beacon.name for name, _ in samples.channels], dtype=bool)
     _, ours, others = np.intersect1d(samples.time, states.time, return_indices=True)
@@ -159,12 +135,7 @@ def _alone(beacon: Beacon, site: Site) -> Site:
 
 
 def places(detected: DetectedFields) -> list[tuple[float, Beacon]]:
-    """Return every place at a minimum of the misfit, with its chi square, best first.
-
-    Returns
-    -------
-    list of (float, Beacon)
-    """
+    """Return every place at a minimum of the misfit, with its chi square, best first."""
     starts = [start for centre in _centres(detected) for start in _starts(detected, *centre)]
     kept: list[tuple[float, Beacon]] = []
     for chi_square, placed in sorted(_refined(detected, starts), key=lambda one: one[0]):

@@ -31,11 +31,7 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
     """Return the smoothed motion between the first and the last epoch, at another rate.
 
     Includes the covariance of the poses, with what the tests of the result have added to it.
-
-    Parameters
-    ----------
-    rate : 'imu' or float
-        At every inertial sample, or at this rate (Hz).
+    `rate`: at every inertial sample, or at this rate (Hz).
     """
     states, offset = result.states, result.calibration.time_offset
     calibration = result.calibration
@@ -77,24 +73,12 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
 
 
 class _Steps(NamedTuple):
-    """Several intervals in one array, padded with steps of zero length, world axes.
+    """Several intervals in one array, padded with steps of zero length, world axes."""
 
-    Parameters
-    ----------
-    length : ndarray, shape (k, steps)
-        (s)
-    rotation : ndarray, shape (k, steps, 3, 3)
-        ``world_from_body`` at the beginning of each step.
-    force_world : ndarray, shape (k, steps, 3)
-        Specific force (m/s^2).
-    gap_bridged : bool ndarray, shape (k,)
-        Intervals with a gap of the inertial stream.
-    """
-
-    length: Array
-    rotation: Array
-    force_world: Array
-    gap_bridged: BoolArray
+    length: Array  # (k, steps) (s)
+    rotation: Array  # (k, steps, 3, 3), ``world_from_body`` at the beginning of each step
+    force_world: Array  # (k, steps, 3), specific force (m/s^2)
+    gap_bridged: BoolArray  # (k,), intervals with a gap of the inertial stream
 
 
 def _pose_cov(
@@ -102,10 +86,7 @@ def _pose_cov(
 ) -> Array:
     """Return the covariance of the poses between the epochs, shape (samples, 6, 6).
 
-    Parameters
-    ----------
-    joint : ndarray, shape (epochs - 1, 30, 30)
-        Of every two successive states.
+    `joint` (epochs - 1, 30, 30): of every two successive states.
     """
     epochs, imu = result.states.time, result.declared.site.platform.imu
     force = stream.accel_body - accel_bias
@@ -182,12 +163,8 @@ def _joint_cov(result: Smoothed) -> Array:
 def _conditioned(steps: _Steps, last: Array, joint: Array, imu: ImuModel) -> Array:
     """Return the covariance of the poses at the end of each step, world axes.
 
-    Parameters
-    ----------
-    last : ndarray, shape (k, 3, 3)
-        ``world_from_body`` at the end of each interval.
-    joint : ndarray, shape (k, 30, 30)
-        Of the states at both ends.
+    `last` (k, 3, 3): ``world_from_body`` at the end of each interval. `joint` (k, 30, 30): of the
+    states at both ends.
     """
     transition, noise = _step_transition(steps, imu)
     whole, total = transition[:, -1], noise[:, -1]

@@ -37,20 +37,11 @@ NEW_RANGE: dict[Parameter, float] = {  # 1 sigma after a change that nobody surv
 
 
 class SiteChange(NamedTuple):
-    """A beacon, or a part of a platform, that has new parameters from a time on.
-
-    Parameters
-    ----------
-    owner : str
-    time : float
-        (s, Unix)
-    platform : int
-        Its index; -1 for a beacon.
-    """
+    """A beacon, or a part of a platform, that has new parameters from a time on."""
 
     owner: str
-    time: float
-    platform: int = -1
+    time: float  # (s, Unix)
+    platform: int = -1  # its index; -1 for a beacon
 
     @property
     def name(self) -> str:
@@ -60,35 +51,21 @@ class SiteChange(NamedTuple):
 
 
 class BlockName(NamedTuple):
-    """Name of a block of parameters in the file of a log.
-
-    Parameters
-    ----------
-    site : bool
-        Whether all platforms share it.
-    """
+    """Name of a block of parameters in the file of a log."""
 
     group: str
     owner: str
     kind: str
     beacon: bool
-    site: bool
+    site: bool  # whether all platforms share it
 
 
 class LogBlocks(NamedTuple):
-    """Parameters of a log.
+    """Parameters of a log."""
 
-    Parameters
-    ----------
-    time : float
-        (s, Unix)
-    platform : int
-    shared, considered : tuple of BlockName
-        Those shared with other logs, and those only considered in every log.
-    """
-
-    time: float
+    time: float  # (s, Unix)
     platform: int
+    # shared, considered: those shared with other logs, and those only considered in every log
     shared: tuple[BlockName, ...]
     considered: tuple[BlockName, ...]
 
@@ -109,31 +86,17 @@ def _on(owner: str, platform: int) -> str:
 
 
 class PlatformCalibration(NamedTuple):
-    """Declared calibration of the site with one platform.
-
-    Parameters
-    ----------
-    shared : Shared
-    considered : tuple of Block
-        Shared parameters that are not estimated.
-    """
+    """Declared calibration of the site with one platform."""
 
     shared: Shared
-    considered: tuple[Block, ...]
+    considered: tuple[Block, ...]  # shared parameters that are not estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Calendar:
-    """Changes of a site, and the parameters of all its logs.
+    """Changes of a site, and the parameters of all its logs."""
 
-    Parameters
-    ----------
-    platforms : tuple of PlatformCalibration
-        With the same beacons.
-    changes : tuple of SiteChange
-    """
-
-    platforms: tuple[PlatformCalibration, ...]
+    platforms: tuple[PlatformCalibration, ...]  # with the same beacons
     changes: tuple[SiteChange, ...] = ()
 
     def owner(self, name: BlockName, platform: int, time: float) -> str:

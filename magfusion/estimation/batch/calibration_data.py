@@ -49,10 +49,7 @@ def _same(one: Any, other: Any) -> bool:
 def _changed(before: Any, data: Any, names: set[str]) -> Any:
     """Return ``before`` with the differences of `_changes`, checked for type and shape.
 
-    Parameters
-    ----------
-    names : set of str
-        Of values that may be added to a mapping.
+    `names`: of values that may be added to a mapping.
     """
     wrong = "has a value that does not match the type or shape of the site's value"
     old = _parts(before)

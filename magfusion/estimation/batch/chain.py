@@ -26,32 +26,17 @@ LEAST_SCATTER = 1e-4  # rad^2; of single-epoch phases, as field models are that 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Initial estimate of the states.
-
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity.
-    phase : ndarray, shape (n, channels)
-        Drive phase of the chosen hypotheses (rad).
-    chosen : int ndarray, shape (n,)
-        Hypothesis of each epoch.
-    cost : float
-        Chi square of the chain.
-    determined : bool ndarray, shape (n,)
-        False where the epoch alone leaves a direction of its pose unobservable.
-    leaps : int
-        Steps between hypotheses that no motion connects.
-    """
+    """Initial estimate of the states."""
 
     __repr__ = short_repr
 
-    states: Trajectory
-    phase: Array
-    chosen: IntArray
-    cost: float
+    states: Trajectory  # with velocity
+    phase: Array  # (n, channels), drive phase of the chosen hypotheses (rad)
+    chosen: IntArray  # (n,), hypothesis of each epoch
+    cost: float  # chi square of the chain
+    # (n,), False where the epoch alone leaves a direction of its pose unobservable
     determined: BoolArray
-    leaps: int = 0
+    leaps: int = 0  # steps between hypotheses that no motion connects
 
 
 def choose_chains(
@@ -59,18 +44,9 @@ def choose_chains(
 ) -> tuple[Start, ...]:
     """Choose chains of hypotheses consistent with gyro, gravity and speed (Viterbi).
 
-    Parameters
-    ----------
-    time_offset : float
-        (s)
-    site : Site
-        Its gravity, and the motion model of its platform.
-
-    Returns
-    -------
-    tuple of Start
-        The best, then those that differ from it at most epochs and are not much worse: the mirrors
-        of a dipole, between which the motion must decide.
+    `time_offset` (s). `site`: its gravity, and the motion model of its platform. Returns the best,
+    then those that differ from it at most epochs and are not much worse: the mirrors of a dipole,
+    between which the motion must decide.
     """
     time = imu.time + time_offset
     turn = turn_from_gyro_at(time, imu.gyro_body, fixes.time)
@@ -159,11 +135,7 @@ def _velocity(time: Array, position: Array) -> Array:
 def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibration:
     """Return the calibration with drive phase and drift estimated from single-epoch phases.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-    phase : ndarray, shape (n, channels)
-        Relative to the calibration's own (rad).
+    `time` (n,). `phase` (n, channels): relative to the calibration's own (rad).
     """
     new_phase, drift = calibration.phase.copy(), calibration.drift.copy()
     elapsed = time - calibration.reference_time

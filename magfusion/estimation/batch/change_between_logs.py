@@ -42,25 +42,15 @@ Load = Callable[[int], LogInformation]
 
 
 class ChangeTest(NamedTuple):
-    """Test of one owner's parameters between two successive logs.
+    """Test of one owner's parameters between two successive logs."""
 
-    Parameters
-    ----------
-    owner : str
-        Among the parameters of all logs.
-    after : int
-        Number of logs before, in the order of their times.
-    chi_square, freedom : float, int
-        With the errors of parameters that are only considered.
-    likelihood_ratio : float
-        Chi square of white noise alone: its difference between two times is that of the logs in
-        between.
-    """
-
-    owner: str
-    after: int
+    owner: str  # among the parameters of all logs
+    after: int  # number of logs before, in the order of their times
+    # chi_square, freedom: with the errors of parameters that are only considered
     chi_square: float
     freedom: int
+    # chi square of white noise alone: its difference between two times is that of the logs in
+    # between
     likelihood_ratio: float
 
     @property
@@ -70,19 +60,11 @@ class ChangeTest(NamedTuple):
 
 
 class FoundChange(NamedTuple):
-    """A change between logs.
+    """A change between logs."""
 
-    Parameters
-    ----------
-    change : SiteChange
-        At the most likely time.
-    test : ChangeTest
-    between : (float, float)
-        Last log that is certainly before, and first that is certainly after (s, Unix).
-    """
-
-    change: SiteChange
+    change: SiteChange  # at the most likely time
     test: ChangeTest
+    # last log that is certainly before, and first that is certainly after (s, Unix)
     between: tuple[float, float]
 
 
@@ -91,14 +73,9 @@ def find_changes(
 ) -> list[FoundChange]:
     """Return the changes that the logs show, the most significant first.
 
-    Parameters
-    ----------
-    logs : sequence of LogBlocks
-        In the order of their times.
-    load : callable
-        Returns the information of a log, by its index, on its own parameters.
-    at : callable
-        Returns the linearisation point of a calendar's parameters, from the declared.
+    `logs`: in the order of their times. `load`: returns the information of a log, by its index, on
+    its own parameters. `at`: returns the linearisation point of a calendar's parameters, from the
+    declared.
     """
     accepted: list[FoundChange] = []
     while len(accepted) < MAX_CHANGES:
@@ -136,22 +113,15 @@ def change_tests(
 
 
 class PeriodTest(NamedTuple):
-    """Parameters of one owner in the logs of one period, against all other logs.
-
-    Parameters
-    ----------
-    logs : int
-        That detect it in the period.
-    chi_square, freedom : float, int
-        Of the difference.
-    difference, sigma : ndarray, shape (k,)
-        Of its parameters, in the order of their blocks; NaN where the logs do not determine it.
-    """
+    """Parameters of one owner in the logs of one period, against all other logs."""
 
     owner: str
-    logs: int
+    logs: int  # that detect it in the period
+    # chi_square, freedom: of the difference
     chi_square: float
     freedom: int
+    # difference, sigma: (k,), of its parameters, in the order of their blocks; NaN where the logs
+    # do not determine it
     difference: Array
     sigma: Array
 
@@ -161,10 +131,7 @@ def period_tests(
 ) -> dict[int, list[PeriodTest]]:
     """Return the test of each owner in each period against all other logs.
 
-    Parameters
-    ----------
-    period : sequence of int
-        Number of each log's period.
+    `period`: number of each log's period.
     """
     known, every = _estimate(calendar, logs, load, at)
     parts: dict[int, LogInformation] = {}
@@ -185,20 +152,11 @@ def period_tests(
 
 
 class _Score(NamedTuple):
-    """Gradient of some logs by new parameters of an owner, in units of the survey's sigmas.
+    """Gradient of some logs by new parameters of an owner, in units of the survey's sigmas."""
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (k,)
-    information : ndarray, shape (k, k)
-        On the change, also the gradient's covariance due to white noise.
-    noise : ndarray, shape (k, k)
-        Further covariance of the gradient.
-    """
-
-    gradient: Array
-    information: Array
-    noise: Array
+    gradient: Array  # (k,)
+    information: Array  # (k, k), on the change, also the gradient's covariance due to white noise
+    noise: Array  # (k, k), further covariance of the gradient
 
     def change(self, scale: Array) -> tuple[Array, Array]:
         """Return the change of the parameters and its sigma; NaN where it is not determined."""

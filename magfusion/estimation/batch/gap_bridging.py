@@ -39,12 +39,7 @@ FIRST = np.repeat([0.05, 0.1, 1.0, 0.01, 0.1], 3)  # rad, m, m/s, rad/s, m/s^2
 def bridge_gaps(log: PreprocessedLog) -> PreprocessedLog:
     """Return the log with windows in the gaps of its inertial stream, where fields allow.
 
-    Unchanged where there are none.
-
-    Raises
-    ------
-    EstimationError
-        Where the graph cannot be solved.
+    Unchanged where there are none. Raises EstimationError where the graph cannot be solved.
     """
     source = log.demodulation
     if log.fixes is not None or not len(source.without_turn):

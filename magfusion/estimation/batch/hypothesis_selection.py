@@ -21,12 +21,8 @@ SHORT = 12  # steps of a comparison
 def select_hypothesis(starts: list[PreprocessedLog]) -> PreprocessedLog:
     """Return the start that agrees best with the motion, where single epochs are ambiguous.
 
-    All are compared on a thinned log, then the best and its rival on the whole one.
-
-    Raises
-    ------
-    EstimationError
-        Where none can be solved.
+    All are compared on a thinned log, then the best and its rival on the whole one. Raises
+    EstimationError where none can be solved.
     """
     if len(starts) == 1:
         return starts[0]

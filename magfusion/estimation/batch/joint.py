@@ -27,18 +27,11 @@ NARROW = 1e-3  # of a sigma; a log does not move a prior so narrow
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """Declared calibration parameters that logs share.
-
-    Parameters
-    ----------
-    declared : Calibration
-    blocks : tuple of Block
-    prior : ndarray, shape (s, s), optional
-        Information of the survey; by default that of the declared site.
-    """
+    """Declared calibration parameters that logs share."""
 
     declared: Calibration
     blocks: tuple[Block, ...]
+    # (s, s), information of the survey; by default that of the declared site
     prior: Array | None = None
 
     @cached_property
@@ -76,23 +69,13 @@ class Shared:
 
 @dataclass(frozen=True, eq=False)
 class SharedCalibration:
-    """Estimate of the shared calibration.
+    """Estimate of the shared calibration."""
 
-    Parameters
-    ----------
-    step : ndarray, shape (s,)
-        From the declared calibration.
-    cov : ndarray, shape (s, s)
-        As estimators use it: by white noise alone.
-    by_common : ndarray, shape (s, c)
-        Change by one sigma of each parameter that is considered in every log.
-    separate_errors : ndarray, shape (s, s)
-        Covariance due to parameters that are considered separately in each log.
-    """
-
-    step: Array
-    cov: Array
+    step: Array  # (s,), from the declared calibration
+    cov: Array  # (s, s), as estimators use it: by white noise alone
+    # (s, c), change by one sigma of each parameter that is considered in every log
     by_common: Array
+    # (s, s), covariance due to parameters that are considered separately in each log
     separate_errors: Array
 
     @property
@@ -103,10 +86,8 @@ class SharedCalibration:
     def of(self, columns: IntArray, common: IntArray) -> "SharedCalibration":
         """Return the marginal of some parameters.
 
-        Parameters
-        ----------
-        columns, common : int ndarray, shapes (s,), (c,)
-            Of the shared parameters, and of those considered in every log.
+        `columns`, `common` (s,), (c,): of the shared parameters, and of those considered in every
+        log.
         """
         square, moved = np.ix_(columns, columns), self.by_common[columns]
         others = np.delete(moved, common, axis=1)
@@ -120,20 +101,11 @@ class SharedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class LogInformation:
-    """Information of one log, or of several, on the shared calibration.
+    """Information of one log, or of several, on the shared calibration."""
 
-    Parameters
-    ----------
-    step : ndarray, shape (s,)
-        From the declared calibration to the linearisation point.
-    part : MarginalizedLog
-    logs : float or ndarray, shape (s,)
-        Number of logs in the sum, that have each parameter.
-    """
-
-    step: Array
+    step: Array  # (s,), from the declared calibration to the linearisation point
     part: MarginalizedLog
-    logs: Array | float = 1.0
+    logs: Array | float = 1.0  # scalar or (s,), number of logs in the sum, that have each parameter
 
     @property
     def by_place(self) -> Array:
@@ -146,12 +118,8 @@ class LogInformation:
     ) -> "LogInformation":
         """Return the same information on more parameters.
 
-        Parameters
-        ----------
-        size, considered : int
-            Number of the shared parameters of all logs, and of those considered in every log.
-        columns, common : int ndarray, shapes (s,), (c,)
-            Those of this log.
+        `size`, `considered`: number of the shared parameters of all logs, and of those considered
+        in every log. `columns`, `common` (s,), (c,): those of this log.
         """
 
         def spread(matrix: Array) -> Array:
@@ -184,17 +152,8 @@ def total_information(
 ) -> LogInformation | None:
     """Return the sum over logs, or over sums of logs, at one linearisation point.
 
-    Parameters
-    ----------
-    logs : iterable of LogInformation
-        Only two are in memory at a time.
-    at : ndarray, shape (s,)
-        From the declared calibration to the linearisation point.
-
-    Returns
-    -------
-    LogInformation, optional
-        None of no log.
+    `logs`: only two are in memory at a time. `at` (s,): from the declared calibration to the
+    linearisation point. Returned None for no log.
     """
 
     def both(a: LogInformation | None, b: LogInformation) -> LogInformation:
@@ -209,12 +168,8 @@ def total_information(
 def known_by(shared: Shared, logs: LogInformation | None, at: Array) -> SharedCalibration:
     """Return the shared calibration from survey and logs after a Gauss-Newton step.
 
-    Parameters
-    ----------
-    logs : LogInformation, optional
-        None for the survey alone.
-    at : ndarray, shape (s,)
-        From the declared calibration to the linearisation point of the step.
+    `logs`: None for the survey alone. `at` (s,): from the declared calibration to the linearisation
+    point of the step.
     """
     prior, unit = shared.information, prior_sigma(shared.blocks)
     information, gradient = prior.copy(), -prior @ at

@@ -32,27 +32,14 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class OfLog:
-    """Data of a log between two rounds, all of which can be written to a file.
+    """Data of a log between two rounds, all of which can be written to a file."""
 
-    Parameters
-    ----------
-    begun : WarmStart
-        Its states, and its declared calibration.
-    steps : ndarray, shape (segments, dimension)
-        From its declared calibration to that of each segment of a long log.
-    noise : tuple of Tuned
-        Estimated when it was smoothed alone.
-    standing : bool ndarray, shape (states,)
-        Where the platform is at rest.
-    information : LogInformation
-        On the shared calibration.
-    """
-
-    begun: WarmStart
+    begun: WarmStart  # its states, and its declared calibration
+    # (segments, dimension), from its declared calibration to that of each segment of a long log
     steps: Array
-    noise: tuple[Tuned, ...]
-    standing: BoolArray
-    information: LogInformation
+    noise: tuple[Tuned, ...]  # estimated when it was smoothed alone
+    standing: BoolArray  # (states,), where the platform is at rest
+    information: LogInformation  # on the shared calibration
 
 
 class Round(NamedTuple):
@@ -94,25 +81,15 @@ def solve_round(
     """Solve a log from its last states, with a prior of the shared calibration.
 
     The waveform is predicted again from these states; the noise estimated from it alone is kept.
-
-    Parameters
-    ----------
-    prior : SharedCalibration
-        In a round that of all logs, `narrowed`; in the end from the survey and all other logs.
-
-    Raises
-    ------
-    EstimationError
-        Where the log is not the one that was smoothed, or cannot be solved.
+    `prior`: in a round that of all logs, `narrowed`; in the end from the survey and all other logs.
+    Raises EstimationError where the log is not the one that was smoothed, or cannot be solved.
     """
     declared = with_noise(kept.begun.declared, kept.noise)
     ready = restore_preprocessed(clean_log(log, site), site, settings, kept.begun)
     blocks, states = ready.blocks, ready.states
     every = tuple(retract(declared, blocks, step) for step in kept.steps)
     ready = replace(
-        ready,
-        declared=with_prior(prior, shared, declared),
-        blocks=as_prior(prior, shared, blocks),
+        ready, declared=with_prior(prior, shared, declared), blocks=as_prior(prior, shared, blocks)
     )
     segments = every if len(every) > 1 else ()
     calibration = every[len(every) // 2]
@@ -163,10 +140,7 @@ def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
 def joint_posterior(kept: OfLog, done: Round, blocks: tuple[Block, ...]) -> Smoothed:
     """Return the posterior of a log in the joint solution, relative to the declared site.
 
-    Parameters
-    ----------
-    blocks : tuple of Block
-        With the declared sigmas.
+    `blocks`: with the declared sigmas.
     """
     samples = done.log.samples if done.wave is None else done.wave.fields
     graph = replace(done.graph, shift=done.shift)

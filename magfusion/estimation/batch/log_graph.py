@@ -42,52 +42,29 @@ from magfusion.units import Array, BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class PreprocessedLog:
-    """A log with an initial estimate.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Of the fields, before the motion is known.
-    steady : SteadyFields, optional
-        Of the same epochs, where the Earth field is measured.
-    epoch : int ndarray, shape (n,)
-        State index of each field epoch.
-    fixes : Fixes, optional
-        Where they enter the graph instead of the phasors.
-    states : Trajectory
-        Initial estimate at all epochs.
-    blocks, considered : tuple of Block
-        Estimated and considered calibration parameters; with fixes the survey's part is added at
-        the end.
-    loss : {None, 'huber', 'cauchy'}
-        Of the fields.
-    others : tuple of (ndarray, Measurement)
-        Further measurements, with the times of their rows (s).
-    rival_chi_square, rival : float, Trajectory, optional
-        As of `Smoothed`.
-    silence : tuple of ndarray, optional
-        Beginnings and ends of gaps in the inertial stream, filled by the motion from the fields
-        (s).
-    user : UserFactors, optional
-        Factors of a user's.
-    """
+    """A log with an initial estimate."""
 
     demodulation: Demodulation
-    samples: FieldSamples
-    steady: SteadyFields | None
-    epoch: IntArray
-    fixes: Fixes | None
+    samples: FieldSamples  # of the fields, before the motion is known
+    steady: SteadyFields | None  # of the same epochs, where the Earth field is measured
+    epoch: IntArray  # (n,), state index of each field epoch
+    fixes: Fixes | None  # where they enter the graph instead of the phasors
     start: Start
-    states: Trajectory
+    states: Trajectory  # initial estimate at all epochs
     declared: Calibration
+    # blocks, considered: estimated and considered calibration parameters; with fixes the survey's
+    # part is added at the end
     blocks: tuple[Block, ...]
     considered: tuple[Block, ...]
-    loss: str | None
+    loss: str | None  # of the fields: 'huber', 'cauchy' or None
+    # further measurements, with the times of their rows (s)
     others: tuple[tuple[Array, Measurement], ...]
+    # rival_chi_square, rival: as of `Smoothed`
     rival_chi_square: float | None = None
     rival: Trajectory | None = None
+    # beginnings and ends of gaps in the inertial stream, filled by the motion from the fields (s)
     silence: tuple[Array, Array] | None = None
-    user: UserFactors | None = None
+    user: UserFactors | None = None  # factors of a user's
 
     @property
     def imu(self) -> ImuSamples:
@@ -106,12 +83,7 @@ class PreprocessedLog:
     def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
         """Return motion-compensated phasors, by the stream that a calibration corrects.
 
-        Includes those of beacons that the motion masked.
-
-        Parameters
-        ----------
-        states : Trajectory
-            At all epochs.
+        Includes those of beacons that the motion masked. `states`: at all epochs.
         """
         log = self.demodulation.log
         imu = calibration.on_log_rate(corrected_imu(calibration, self.blocks, self.imu))
@@ -160,15 +132,10 @@ def graph_of(
 ) -> tuple[Graph, int]:
     """Return the graph at an estimate, and the number of bridged intervals.
 
-    Parameters
-    ----------
-    wave : MotionCompensated, optional
-        Phasors compensated by an estimate; by default those of the log.
-    standing : bool ndarray, shape (states,), optional
-        Where the platform is known to be at rest.
-    roughly : bool
-        Whether another graph will follow, and this one does not determine the final noise: the
-        sigmas of the inertial factors may then be a tenth off.
+    `wave`: phasors compensated by an estimate; by default those of the log. `standing` (states,):
+    where the platform is known to be at rest. `roughly`: whether another graph will follow, and
+    this one does not determine the final noise: the sigmas of the inertial factors may then be a
+    tenth off.
     """
     links, gap_bridged = _links(log, states, calibration, roughly=roughly)
     measurements = [_at_states(log, *other, states, calibration) for other in log.others]

@@ -43,24 +43,13 @@ LEAST_DETECTED = 10  # minimum number of epochs with a detected beacon for a sta
 
 
 class OfflineStart(NamedTuple):
-    """A start with the calibration estimated from its drive phases.
+    """A start with the calibration estimated from its drive phases."""
 
-    Parameters
-    ----------
-    start : Start
-        Of the fixes' hypotheses.
-    states : Trajectory
-        Initial estimate: those of the start, or from a track.
-    declared : Calibration
-        Unsynchronised drives have no declared phase: their prior is centred on the start.
-    fixes : Fixes, optional
-        Of the epochs at which a beacon is detected; None where there are too few.
-    """
-
-    start: Start
-    states: Trajectory
+    start: Start  # of the fixes' hypotheses
+    states: Trajectory  # initial estimate: those of the start, or from a track
+    # unsynchronised drives have no declared phase: their prior is centred on the start
     declared: Calibration
-    fixes: Fixes | None
+    fixes: Fixes | None  # of the epochs at which a beacon is detected; None where there are too few
 
 
 def begin(
@@ -68,10 +57,7 @@ def begin(
 ) -> list[OfflineStart]:
     """Return the starts between which the motion selects.
 
-    Parameters
-    ----------
-    steady : SteadyFields, optional
-        At the same times; without it every epoch needs a beacon.
+    `steady`: at the same times; without it every epoch needs a beacon.
     """
     detected = np.asarray(samples.valid.any(axis=1))
     if steady is not None and np.sum(detected) < LEAST_DETECTED:
@@ -156,12 +142,7 @@ def _rest_bias(imu: ImuSamples, calibration: Calibration) -> Array:
 def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
     """Return attitudes from gravity and the Earth field, at rest amid the beacons.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Only its times are used.
-    steady : SteadyFields
-        At the same times.
+    `samples`: only its times are used. `steady`: at the same times.
     """
     assert site.earth_field_world is not None
     time, n = samples.time, len(samples)
@@ -193,12 +174,7 @@ def propagated_states(
 ) -> Trajectory:
     """Return states at other epochs: from the nearest known one, rotated by the gyro.
 
-    Parameters
-    ----------
-    time_offset : float
-        (s)
-    time : ndarray, shape (n,)
-        (s)
+    `time_offset` (s), `time` (n,) (s).
     """
     if np.array_equal(known.time, time):
         return known

@@ -23,15 +23,9 @@ def on_new_clock(
 
     The inertial stream was cut by the old clock: a pass determines the platform's motion at an
     epoch by the state and the lag between both clocks.  The next pass cuts by the new clock and
-    starts from these states.  Without the lag it would use a motion delayed by the estimated
-    clock offset.
-
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity and bias, by the old clock.
-    standing : bool ndarray, shape (states,)
-        Where the platform is known to be at rest, so that no clock moves it.
+    starts from these states.  Without the lag it would use a motion delayed by the estimated clock
+    offset. `states`: with velocity and bias, by the old clock. `standing` (states,): where the
+    platform is known to be at rest, so that no clock moves it.
     """
     lag = np.where(standing, 0.0, new.imu_offset(states.time) - old.imu_offset(states.time))
     velocity, bias = states.velocity_world, states.gyro_bias_body

@@ -16,12 +16,7 @@ from magfusion.estimation.graph.gtsam_graph import NativeProblem
 from magfusion.estimation.measurements.zero_velocity import may_stand, slow_enough_to_stand
 from magfusion.estimation.posterior.convergence import settled_at
 from magfusion.estimation.posterior.fixed_point_acceleration import Step, part_of_the_way
-from magfusion.estimation.posterior.noise_tuning import (
-    Tuned,
-    as_declared,
-    plausible,
-    with_noise,
-)
+from magfusion.estimation.posterior.noise_tuning import Tuned, as_declared, plausible, with_noise
 from magfusion.estimation.posterior.noise_tuning import has_converged as same_noise
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory
@@ -36,26 +31,14 @@ ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a p
 
 
 class SolvedPass(NamedTuple):
-    """The solved graph of a pass.
-
-    Parameters
-    ----------
-    states : Trajectory
-        Without covariance.
-    gaps : int
-        Number of intervals with a bridged gap.
-    was_stationary : bool ndarray, shape (states,)
-        Where the platform was detected at rest.
-    iterations : int
-        Of the optimiser, including those before rests were detected.
-    """
+    """The solved graph of a pass."""
 
     graph: Graph
     solution: Optimised[GraphEstimate]
-    states: Trajectory
-    gaps: int
-    was_stationary: BoolArray
-    iterations: int
+    states: Trajectory  # without covariance
+    gaps: int  # number of intervals with a bridged gap
+    was_stationary: BoolArray  # (states,), where the platform was detected at rest
+    iterations: int  # of the optimiser, including those before rests were detected
 
 
 def begin_iterations(log: PreprocessedLog, settings: SmootherSettings) -> IterationState:
@@ -74,24 +57,12 @@ def begin_iterations(log: PreprocessedLog, settings: SmootherSettings) -> Iterat
 
 
 class IterationPlan(NamedTuple):
-    """Settings of the next pass.
+    """Settings of the next pass."""
 
-    Parameters
-    ----------
-    short : bool
-        Whether the optimiser may end early.
-    finds_noise : bool
-        Whether noise and model error are estimated from its residuals.
-    roughly : bool
-        Whether approximate sigmas of its graph suffice.
-    engine : {'bordered', 'gtsam'}
-        Optimiser.
-    """
-
-    short: bool
-    finds_noise: bool
-    roughly: bool
-    engine: str
+    short: bool  # whether the optimiser may end early
+    finds_noise: bool  # whether noise and model error are estimated from its residuals
+    roughly: bool  # whether approximate sigmas of its graph suffice
+    engine: str  # optimiser, 'bordered' or 'gtsam'
 
 
 def plan_pass(
@@ -131,10 +102,7 @@ def solve_about(
 ) -> SolvedPass:
     """Solve the graph linearised at the states of the last pass.
 
-    Parameters
-    ----------
-    calm : bool ndarray, shape (states,)
-        Where the IMU is quiet, so that the platform may be at rest.
+    `calm` (states,): where the IMU is quiet, so that the platform may be at rest.
     """
     time, motion = now.states.time, log.declared.site.platform.motion
     tolerance = ON_THE_WAY if plan.short else CONVERGED

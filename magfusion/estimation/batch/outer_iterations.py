@@ -24,63 +24,35 @@ from magfusion.units import BoolArray
 
 @dataclass(frozen=True, eq=False)
 class IterationState:
-    """State of a log after a pass.
+    """State of a log after a pass."""
 
-    Parameters
-    ----------
-    done, iterations : int
-        Number of passes, and of the iterations in them.
-    tuning : bool
-        Whether noise and model error are still being estimated.
-    states : Trajectory
-        At all epochs, without covariance.
-    declared, calibration : Calibration
-        With the estimated noise.
-    segments : tuple of Calibration
-        Of every segment of a long log.
-    standing : bool ndarray, shape (states,)
-        Where the platform is known to be at rest.
-    tuned : tuple of Tuned
-    step : Step, optional
-        Of the pass.
-    """
-
+    # done, iterations: number of passes, and of the iterations in them
     done: int
     iterations: int
-    tuning: bool
-    states: Trajectory
+    tuning: bool  # whether noise and model error are still being estimated
+    states: Trajectory  # at all epochs, without covariance
+    # declared, calibration: with the estimated noise
     declared: Calibration
     calibration: Calibration
-    segments: tuple[Calibration, ...]
-    standing: BoolArray
+    segments: tuple[Calibration, ...]  # of every segment of a long log
+    standing: BoolArray  # (states,), where the platform is known to be at rest
     tuned: tuple[Tuned, ...]
-    step: Step | None = None
+    step: Step | None = None  # of the pass
 
 
 @dataclass(frozen=True)
 class PassFile:
-    """A checkpoint of the passes over one log.
-
-    Parameters
-    ----------
-    place : Path
-    key : str
-        Of the run (`magfusion.files.checkpoint.run_key`).
-    resume : bool
-        Whether to continue from the state of an earlier run.
-    """
+    """A checkpoint of the passes over one log."""
 
     place: Path
-    key: str
-    resume: bool
+    key: str  # of the run (`magfusion.files.checkpoint.run_key`)
+    resume: bool  # whether to continue from the state of an earlier run
 
     def begun(self, log: PreprocessedLog) -> IterationState | None:
         """Return the state of an earlier run; None without one, or where a new run is requested.
 
-        Raises
-        ------
-        InputError
-            Where the file is damaged, is of another log, site or setting, or is no checkpoint.
+        Raises InputError where the file is damaged, is of another log, site or setting, or is no
+        checkpoint.
         """
         result = read_checkpoint(self.place, self.key) if self.resume else None
         if result is None:
@@ -97,10 +69,7 @@ class PassFile:
     ) -> None:
         """Write the state of a pass, replacing that of the pass before only when complete.
 
-        Parameters
-        ----------
-        declared : Calibration
-            Before the first pass.
+        `declared`: before the first pass.
         """
         content = to_plain(passed, calibration_rules(declared, blocks))
         write_checkpoint(Checkpoint(self.key, passed.done, content), self.place)

@@ -39,23 +39,12 @@ SPARSE = 2.5  # times the usual interval; a longer one is a gap
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """Start of a log that was smoothed before.
+    """Start of a log that was smoothed before."""
 
-    Parameters
-    ----------
-    states : Trajectory
-        At all its epochs, without covariance.
-    declared : Calibration
-        Its declared calibration, before it was smoothed.
-    start : Start
-        From which the states were estimated.
-    rival_chi_square, rival : float, Trajectory, optional
-        As of `magfusion.estimation.batch.batch.Smoothed`.
-    """
-
-    states: Trajectory
-    declared: Calibration
-    start: Start
+    states: Trajectory  # at all its epochs, without covariance
+    declared: Calibration  # its declared calibration, before it was smoothed
+    start: Start  # from which the states were estimated
+    # rival_chi_square, rival: as of `magfusion.estimation.batch.batch.Smoothed`
     rival_chi_square: float | None = None
     rival: Trajectory | None = None
 
@@ -76,12 +65,7 @@ class _Demodulated(NamedTuple):
 def preprocess(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreprocessedLog:
     """Return a log with the start that the motion selects.
 
-    Raises
-    ------
-    InputError
-        Where the log has no usable data.
-    EstimationError
-        Where it has too few epochs.
+    Raises InputError where the log has no usable data; EstimationError where it has too few epochs.
     """
     report("demodulating", 0, settings.max_iterations + 3)
     detected = _demodulated(log, site, settings)
@@ -212,12 +196,7 @@ def _in_gaps(
 ) -> Array:
     """Return the times of states where no field is measured (s), more where the IMU is quiet.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Measured; there are none between whole rests, nor within them.
-    time_offset : float
-        (s)
+    `samples`: measured; there are none between whole rests, nor within them. `time_offset` (s).
     """
     time = samples.time
     step, out = np.diff(time), [np.zeros(0)]

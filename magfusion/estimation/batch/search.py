@@ -12,7 +12,6 @@ import numpy as np
 
 from magfusion.estimation.batch.strides import Strides, strides_between
 from magfusion.estimation.batch.tracks import (
-    MOTION,
     TrackPhasors,
     Tracks,
     propagate_tracks,
@@ -20,6 +19,7 @@ from magfusion.estimation.batch.tracks import (
     track_phasors,
     updated,
 )
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.channel_effects import of_all_sensors
@@ -47,21 +47,11 @@ FIRST_ROTATION, FIRST_POSITION, FIRST_PHASE = 0.5, 1.0, 1.0  # rad, m, rad; if u
 
 @dataclass(frozen=True, eq=False)
 class FoundTrajectory:
-    """Trajectory of a track.
+    """Trajectory of a track."""
 
-    Parameters
-    ----------
-    states : Trajectory
-        At some of the epochs, with velocity.
-    phase : ndarray, shape (n, channels)
-        Drive phase relative to the calibration's (rad).
-    cost : float
-        Of its track.
-    """
-
-    states: Trajectory
-    phase: Array
-    cost: float
+    states: Trajectory  # at some of the epochs, with velocity
+    phase: Array  # (n, channels), drive phase relative to the calibration's (rad)
+    cost: float  # of its track
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +101,7 @@ def search(
 ) -> list[FoundTrajectory]:
     """Return the trajectories that explain a log best, the most probable first.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Epochs of the fixes.
-    imu : ImuSamples
-        With the gyro's bias at rest removed.
+    `samples`: epochs of the fixes. `imu`: with the gyro's bias at rest removed.
     """
     kept = thinned(samples)
     some = samples.rows(kept)

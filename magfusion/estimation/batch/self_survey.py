@@ -37,35 +37,20 @@ MOST_SMOOTHED = 3
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Candidate pose of an unknown beacon.
+    """Candidate pose of an unknown beacon."""
 
-    Parameters
-    ----------
-    beacon : Beacon
-        Placed, with a wide prior.
-    chi_square : float
-        Above that of the best: along the known beacons' trajectory, or of the whole log where it
-        was smoothed with this place.
-    smoothed : bool
-        Whether it is that of the whole log.
-    """
-
-    beacon: Beacon
+    beacon: Beacon  # placed, with a wide prior
+    # above that of the best: along the known beacons' trajectory, or of the whole log where it was
+    # smoothed with this place
     chi_square: float
-    smoothed: bool = False
+    smoothed: bool = False  # whether it is that of the whole log
 
 
 class Placement(NamedTuple):
-    """Candidate poses of one unknown beacon.
-
-    Parameters
-    ----------
-    hypotheses : tuple of Hypothesis
-        Best first.
-    """
+    """Candidate poses of one unknown beacon."""
 
     name: str
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[Hypothesis, ...]  # best first
 
 
 def smooth_and_place(
@@ -77,19 +62,10 @@ def smooth_and_place(
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth a log and place the beacons that the site declares unknown.
 
-    Parameters
-    ----------
-    site : Site
-        Without unknown beacons this is `magfusion.estimation.batch.batch.smooth`.
-    iterations_file : PassFile, optional
-        Of a log whose beacons are all known.
-
-    Raises
-    ------
-    InputError
-        Where too few beacons are known.
-    EstimationError
-        Where an unknown beacon was not detected, or the graph cannot be solved.
+    `site`: without unknown beacons this is `magfusion.estimation.batch.batch.smooth`.
+    `iterations_file`: of a log whose beacons are all known. Raises InputError where too few beacons
+    are known; EstimationError where an unknown beacon was not detected, or the graph cannot be
+    solved.
     """
     unknown = [beacon for beacon in site.beacons if beacon.unknown is not None]
     if not unknown:
@@ -164,25 +140,11 @@ def _with_prior(placed: Beacon, declared: Beacon) -> Beacon:
 
 
 def decide(
-    log: Log,
-    site: Site,
-    settings: SmootherSettings,
-    report: Report,
-    result: list[Placement],
+    log: Log, site: Site, settings: SmootherSettings, report: Report, result: list[Placement]
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth the log with the most probable places; the whole graph decides between them.
 
-    Parameters
-    ----------
-    result : list of Placement
-        One for each unknown beacon of the site.
-
-    Returns
-    -------
-    Smoothed
-        With the places that explain the log best.
-    tuple of Placement
-        Best first.
+    `result`: one for each unknown beacon of the site. The best first.
     """
     choices = list(product(*(range(len(placement.hypotheses)) for placement in result)))
 

@@ -13,28 +13,16 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Strides:
-    """Rotation and displacement from each epoch to the next, in the body axes of the earlier.
+    """Rotation and displacement from each epoch to the next, in the body axes of the earlier."""
 
-    Parameters
-    ----------
-    dt : ndarray, shape (n,)
-        (s)
-    turn : ndarray, shape (n, 3, 3)
-        ``earlier_from_later``.
-    velocity, displacement : ndarray, shape (n, 3)
-        By the specific force alone, from rest (m/s, m).
-    lever : ndarray, shape (n, 3, 3)
-        Integral of the rotation, by which an accelerometer bias changes the velocity (s).
-    gap_bridged : bool ndarray, shape (n,)
-        Where the stream has a gap.
-    """
-
-    dt: Array
-    turn: Array
+    dt: Array  # (n,) (s)
+    turn: Array  # (n, 3, 3), ``earlier_from_later``
+    # velocity, displacement: (n, 3), by the specific force alone, from rest (m/s, m)
     velocity: Array
     displacement: Array
+    # (n, 3, 3), integral of the rotation, by which an accelerometer bias changes the velocity (s)
     lever: Array
-    gap_bridged: BoolArray
+    gap_bridged: BoolArray  # (n,), where the stream has a gap
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -43,12 +31,8 @@ class Strides:
 def strides_between(imu: ImuSamples, time_offset: float, epochs: Array) -> Strides:
     """Return the strides of a stream between epochs.
 
-    Parameters
-    ----------
-    time_offset : float
-        Added to its stamps to bring them to the log's clock (s).
-    epochs : ndarray, shape (n + 1,)
-        (s); where they lie outside the stream its end values are extended.
+    `time_offset`: added to its stamps to bring them to the log's clock (s). `epochs` (n + 1,) (s);
+    where they lie outside the stream its end values are extended.
     """
     usual = float(np.median(np.diff(imu.time)))
     stamps, rate_body, accel_body = _reaching(imu, time_offset, epochs)

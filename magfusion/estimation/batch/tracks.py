@@ -16,6 +16,7 @@ from magfusion.estimation.graph.preintegration import (
     BRIDGE_GYRO_NOISE,
     bias_walks,
 )
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import whitened
 from magfusion.model.channel_effects import of_all_sensors
@@ -26,44 +27,29 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
-ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL, GYRO = slice(9, 12), slice(12, 15)
-MOTION = 15
 ROUNDS = 3  # of linearisation in one update: the first prediction may be wide
 STRONG_CHI_SQUARE = 16.0  # times the expected chi square, above which a channel is downweighted
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Filters at one epoch, one row each.
+    """Filters at one epoch, one row each."""
 
-    Parameters
-    ----------
-    rotation : ndarray, shape (h, 3, 3)
-        world_from_body.
-    position, velocity : ndarray, shape (h, 3)
-        World (m, m/s).
-    accel_bias, gyro_bias : ndarray, shape (h, 3)
-        Body (m/s^2, rad/s).
-    phase, rate : ndarray, shape (h, channels of a magnetometer)
-        Drive phase at this epoch (rad), and its rate relative to the nominal one (rad/s).
-    cov : ndarray, shape (h, 15 + 2 free, 15 + 2 free)
-    cost : ndarray, shape (h,)
-        Minus twice the logarithm of the likelihood, up to a common constant.
-    parent : int ndarray, shape (h,)
-        Row at the epoch before; at the first epoch its own.
-    """
-
-    rotation: Array
+    rotation: Array  # (h, 3, 3), world_from_body
+    # position, velocity: (h, 3), world (m, m/s)
     position: Array
     velocity: Array
+    # accel_bias, gyro_bias: (h, 3), body (m/s^2, rad/s)
     accel_bias: Array
     gyro_bias: Array
+    # phase, rate: (h, channels of a magnetometer), drive phase at this epoch (rad), and its rate
+    # relative to the nominal one (rad/s)
     phase: Array
     rate: Array
-    cov: Array
-    cost: Array
-    parent: IntArray
+    cov: Array  # (h, 15 + 2 free, 15 + 2 free)
+    cost: Array  # (h,), minus twice the logarithm of the likelihood, up to a common constant
+    parent: IntArray  # (h,), row at the epoch before; at the first epoch its own
 
     def __len__(self) -> int:
         return len(self.cost)
@@ -79,29 +65,15 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class TrackPhasors:
-    """Phasors of all epochs, prepared for tracks.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (n, channels, 6)
-        (T); zero where missing.
-    sqrt_information : ndarray, shape (n, channels, 3, 3)
-        Whitening, including the survey's error.
-    components : ndarray, shape (n,)
-        Number of components present.
-    free_phases : bool ndarray, shape (channels of a magnetometer,)
-        Whether the drive phase is unknown.
-    blocks : tuple of Block
-        Of the unknown phases.
-    """
+    """Phasors of all epochs, prepared for tracks."""
 
     calibration: Calibration
     time: Array
-    measured: Array
-    sqrt_information: Array
-    components: Array
-    free_phases: BoolArray
-    blocks: tuple[Block, ...]
+    measured: Array  # (n, channels, 6) (T); zero where missing
+    sqrt_information: Array  # (n, channels, 3, 3), whitening, including the survey's error
+    components: Array  # (n,), number of components present
+    free_phases: BoolArray  # (channels of a magnetometer,), whether the drive phase is unknown
+    blocks: tuple[Block, ...]  # of the unknown phases
 
     @property
     def site(self) -> Site:
@@ -228,11 +200,7 @@ def rows_at(tracks: Tracks, phasors: TrackPhasors, k: int) -> tuple[Array, Array
         reference_time=float(time),
     )
     value, by_pose, by_phase = linearize_channels(
-        known,
-        phasors.blocks,
-        np.full(len(tracks), time),
-        tracks.rotation,
-        tracks.position,
+        known, phasors.blocks, np.full(len(tracks), time), tracks.rotation, tracks.position
     )
     back = np.swapaxes(tracks.rotation, 1, 2)[:, None]
     none = np.zeros((*value.shape, 9))

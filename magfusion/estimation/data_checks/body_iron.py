@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from magfusion.estimation.data_checks.still_means import StillMeans
+from magfusion.estimation.data_checks.turning import CORRELATED
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -24,7 +25,6 @@ LIMIT = 8.5  # sigma of twelve numbers, 6 of one
 USUAL_MOUNTING = 0.1  # rad
 LEAST_SHARE = 0.01  # of the field's size, from which iron is reported
 EXPLAINED = 0.8  # share of the residual
-CORRELATED = 2.0  # consecutive spans that share one residual
 # What a turn of the mounting does to matrix and offset, by its three components.
 _MOUNTING = np.zeros((12, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -34,10 +34,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     """Yield the body-fixed iron that the declared calibration does not account for.
 
-    Parameters
-    ----------
-    means : StillMeans
-        Over spans of `IRON_SPAN`.
+    `means`: over spans of `IRON_SPAN`.
     """
     if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
         return
@@ -80,11 +77,7 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
 def _fitted(turn: Array, before: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return matrix (9, row by row) and offset (3), their covariance, and the explained share.
 
-    Parameters
-    ----------
-    turn : ndarray, shape (n, 3, 3)
-    before, residual : ndarray, shape (n, 3)
-        Fields in units of their size.
+    `turn` (n, 3, 3). `before`, `residual` (n, 3): fields in units of their size.
     """
     rotated = np.einsum("nij,nj->ni", turn, before)
     eye = np.eye(3)

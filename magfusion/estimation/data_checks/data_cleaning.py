@@ -29,12 +29,8 @@ from magfusion.units import IntArray
 def clean_log(log: Log, site: Site) -> Log:
     """Return a log with single wrong stamps and samples corrected.
 
-    Its ``clocks`` and ``noticed`` report the corrections.
-
-    Raises
-    ------
-    InputError
-        Where most samples of an instrument are beyond its declared range.
+    Its ``clocks`` and ``noticed`` report the corrections. Raises InputError where most samples of
+    an instrument are beyond its declared range.
     """
     log = _without_freeze(on_even_clocks(_within_range(log, site), site), site)
     log = _without_pauses(log, site)

@@ -101,13 +101,9 @@ def above_noise(samples: FieldSamples, least: float) -> BoolArray:
 def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> BoolArray:
     """Return which phasors are of a beacon, shape (n, channels): above noise for several windows.
 
-    A window in which a beacon stops or starts contains an unknown part of its tone, so that
-    windows overlapping one without the beacon are not counted.
-
-    Parameters
-    ----------
-    least : float
-        Threshold for the chi square of a phasor's six components against zero.
+    A window in which a beacon stops or starts contains an unknown part of its tone, so that windows
+    overlapping one without the beacon are not counted. `least`: threshold for the chi square of a
+    phasor's six components against zero.
     """
     # A field perpendicular to the available axes looks like silence.
     strong = above_noise(samples, least) | samples.partial
@@ -140,12 +136,7 @@ class DetectionFilter:
     def of(self, samples: FieldSamples, step: float) -> FieldSamples:
         """Return an epoch's samples without the beacons that are not detected.
 
-        Parameters
-        ----------
-        samples : FieldSamples
-            One epoch.
-        step : float
-            Since the previous epoch (s).
+        `samples`: one epoch. `step`: since the previous epoch (s).
         """
         strong, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
         reach = int(np.ceil(samples.window[0] / step - 1e-6))

@@ -54,12 +54,8 @@ def with_disturbing_lines(
     """Return settings by which the lines that would disturb the tones are fitted with them.
 
     By the beginning of the log; unchanged where nothing disturbs, or the tones are in slots.
-
-    Parameters
-    ----------
-    lockin : LockinSettings, optional
-        As requested: its window is kept.  A window that is chosen by the tones depends on the
-        lines, too.
+    `lockin`: as requested: its window is kept. A window that is chosen by the tones depends on the
+    lines, too.
     """
     wave = log.waveform
     if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
@@ -104,12 +100,8 @@ def _fitting(
 ) -> LockinSettings | None:
     """Return settings that fit one more line, if a window can be long enough to separate it.
 
-    Parameters
-    ----------
-    others_hz : ndarray
-        Tones, and lines that are already fitted.
-    requested : bool
-        Whether the window was requested, and is kept.
+    `others_hz`: tones, and lines that are already fitted. `requested`: whether the window was
+    requested, and is kept.
     """
     separate = float(np.min(np.abs(line_hz - others_hz)))
     needed = (SEPARATED if requested else 2.0) / separate

@@ -13,12 +13,8 @@ MIN_REPEATS = 6  # equal samples in a row, at least
 class Freeze:
     """Freeze detector of one instrument, fed with its samples in order.
 
-    Attributes
-    ----------
-    frozen_since : float
-        Stamp of the first sample equal to the newest (s).
-    is_frozen : bool
-        Whether the instrument is frozen at the newest sample.
+    `frozen_since`: stamp of the first sample equal to the newest (s). `is_frozen`: whether the
+    instrument is frozen at the newest sample.
     """
 
     frozen_since: float
@@ -97,12 +93,8 @@ def imu_remarks(
 ) -> tuple[Finding, ...]:
     """Return the findings on the IMU between two epochs (s).
 
-    Parameters
-    ----------
-    start_time : float, optional
-        Start of a freeze (s); None where there is none.
-    gap_bridged : bool
-        Whether samples are missing there.
+    `start_time`: start of a freeze (s); None where there is none. `gap_bridged`: whether samples
+    are missing there.
     """
     if start_time is not None and end > start_time:
         text = f"all axes are frozen since {start_time:.2f} s: the sensor or its driver hangs."

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.still_means import (
     SPAN,
     StillMeans,
@@ -26,7 +27,6 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
-LIMIT = 6.0  # sigma
 FORCE_LIMIT = 5.0  # sigma of the accelerometer's bias
 MISSING = 0.35  # of gravity; less of it is no gravity
 UNIT = 0.06  # relative; as near gravity in another unit must be
@@ -51,14 +51,9 @@ def gravity_and_field_findings(
 ) -> Iterator[Finding]:
     """Yield inconsistencies of gravity and static field with the accelerometer and the site.
 
-    The gyroscope, which stabilizes the axes, must be correct.
-
-    Parameters
-    ----------
-    poses : Trajectory, optional
-        By the beacons: they decide which of vertical and field is wrong.
-    estimated : Trajectory, optional
-        By an estimator that also used gravity; decides the cause of a reversed vertical.
+    The gyroscope, which stabilizes the axes, must be correct. `poses`: by the beacons: they decide
+    which of vertical and field is wrong. `estimated`: by an estimator that also used gravity;
+    decides the cause of a reversed vertical.
     """
     means = still_means(log, site)
     if len(means) == 0:
@@ -163,7 +158,7 @@ def wrong_size(means: StillMeans, site: Site) -> Iterator[Finding]:
         )
     )
     off = abs(size - declared)
-    if not off > max(LIMIT * sigma, 0.1 * declared):
+    if not off > max(DETECTION_SIGMAS * sigma, 0.1 * declared):
         return
     factor = size / declared
     unit = next(
@@ -194,24 +189,20 @@ def wrong_dip(
 ) -> Iterator[Finding]:
     """Yield an angle between vertical and field that differs from the declared Earth field's.
 
-    Parameters
-    ----------
-    mounted : bool
-        Whether gyroscope and field agree, so that the mounting is as declared.
-    upright : bool, optional
-        Whether the poses have the accelerometer's vertical pointing up; None where unknown.
+    `mounted`: whether gyroscope and field agree, so that the mounting is as declared. `upright`:
+    whether the poses have the accelerometer's vertical pointing up; None where unknown.
     """
     assert site.earth_field_world is not None
     declared = float(angle_between(np.array([0.0, 0.0, 1.0]), site.earth_field_world))
     angle, sigma = float(np.median(means.angle)), _dip_sigma(means, site)
-    if not abs(angle - declared) > LIMIT * sigma:
+    if not abs(angle - declared) > DETECTION_SIGMAS * sigma:
         return
     findings = (
         f"the angle between static field and accelerometer's vertical is {angle / DEGREE:.0f} deg,"
         f" of the declared Earth field {declared / DEGREE:.0f} deg"
         f" ({abs(angle - declared) / sigma:.0f} sigma)"
     )
-    if abs(np.pi - angle - declared) < LIMIT * sigma:
+    if abs(np.pi - angle - declared) < DETECTION_SIGMAS * sigma:
         code, cause = _reversed(means, mounted=mounted, upright=upright)
     else:
         cause = (
@@ -291,7 +282,7 @@ def _tilted(here: _InWorld, site: Site) -> Iterator[Finding]:
     """Yield an accelerometer's vertical that differs from that of the poses."""
     tilt = float(np.median(angle_between(here.up, np.array([0.0, 0.0, 1.0]))))
     sigma = float(np.hypot(site.platform.imu.accel_bias_sigma / site.gravity, TILT))
-    if not tilt > LIMIT * sigma:
+    if not tilt > DETECTION_SIGMAS * sigma:
         return
     reversed_ = _is_reversed(here)
     cause = (
@@ -334,7 +325,7 @@ def wrong_field(here: _InWorld, site: Site) -> Iterator[Finding]:
     findings = (
         f"the static field at the estimated poses is {dip / DEGREE:.0f} deg from the vertical"
     )
-    if abs(off_dip) > LIMIT * sigma:
+    if abs(off_dip) > DETECTION_SIGMAS * sigma:
         yield Finding(
             "earth_field",
             f"{findings}, earth_field_t {(dip - off_dip) / DEGREE:.0f} deg; gravity agrees with the"
@@ -343,7 +334,7 @@ def wrong_field(here: _InWorld, site: Site) -> Iterator[Finding]:
             Verdict.DOUBTFUL,
             abs(off_dip) / sigma,
         )
-    elif abs(heading) > LIMIT * of_heading and across > LEVEL_FIELD:
+    elif abs(heading) > DETECTION_SIGMAS * of_heading and across > LEVEL_FIELD:
         yield Finding(
             "earth_field",
             "the heading of the static field at the estimated poses differs from earth_field_t by"

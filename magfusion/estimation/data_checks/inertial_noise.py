@@ -11,7 +11,7 @@ from magfusion.model.site import ImuModel, Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-BLOCK = 128  # samples per noise measurement
+BLOCK = 128  # samples in which noise, or the scatter, is measured
 QUIETEST = 0.1  # share of the blocks that are assumed to be without vibration
 MIN_BLOCKS = 4  # blocks
 MORE = 4.0  # times what is declared; a declared density is a prior with a factor of two
@@ -21,14 +21,8 @@ def white_density(time: Array, value: Array) -> Array | None:
     """Return the white-noise density of each axis, shape (3,); None for too few samples.
 
     Third differences suppress the platform's motion and turn white noise of variance ``v`` into
-    ``20 v``; only the quietest blocks count, which excludes vibration.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    value : ndarray, shape (n, 3)
-        In any unit; the density is in that unit per square root of hertz.
+    ``20 v``; only the quietest blocks count, which excludes vibration. `time` (n,) (s).
+    `value` (n, 3): in any unit; the density is in that unit per square root of hertz.
     """
     residual = np.diff(value, n=3, axis=0)
     count = len(residual) // BLOCK

@@ -55,10 +55,7 @@ class Repetition:
     def pauses(self, rows: Array, repeated: BoolArray, *, final: bool) -> Runs:
         """Return the pauses among samples (n + 1, axes), of which (n,) are repeated.
 
-        Parameters
-        ----------
-        final : bool
-            Whether one may last until the end, if another was as long.
+        `final`: whether one may last until the end, if another was as long.
         """
         stretches = runs(repeated)
         after = np.minimum(stretches.last + 1, len(rows) - 1)
@@ -125,15 +122,8 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
 class PauseFilter:
     """Leaves the pauses of a stream out; repeated samples wait for the end of theirs.
 
-    Parameters
-    ----------
-    patient : bool
-        Whether the first samples wait until the chance of a repetition is known.
-
-    Attributes
-    ----------
-    left_out : int
-        Repeated samples so far.
+    `patient`: whether the first samples wait until the chance of a repetition is known. `left_out`:
+    repeated samples so far.
     """
 
     def __init__(self, *, patient: bool = True) -> None:

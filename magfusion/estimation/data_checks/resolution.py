@@ -26,15 +26,8 @@ def within_a_step(
     """Return which constant stretches may be a field that moved by less than a step.
 
     A stretch at the end shows no next value: the other axes must be at rest, or, where all are
-    constant, an earlier stretch must have been as long.
-
-    Parameters
-    ----------
-    value : ndarray, shape (n, axes)
-    axes : tuple of int
-        Those that are constant.
-    first, last : int ndarray, shape (k,)
-        Samples of the stretches, both inclusive.
+    constant, an earlier stretch must have been as long. `value` (n, axes). `axes`: those that are
+    constant. `first`, `last` (k,): samples of the stretches, both inclusive.
     """
     step, ends = _step(value), last + 1 < len(value)
     after = np.minimum(last + 1, len(value) - 1)

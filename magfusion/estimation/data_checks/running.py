@@ -9,22 +9,13 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class DecayingSums:
-    """Sums with weights that decrease exponentially with age.
+    """Sums with weights that decrease exponentially with age."""
 
-    Parameters
-    ----------
-    total : ndarray
-        Of the weighted samples.
-    weight, squares : float
-        Of the weights, and of their squares.
-    time : float
-        Of the last sample (s).
-    """
-
-    total: Array
+    total: Array  # of the weighted samples
+    # weight, squares: of the weights, and of their squares
     weight: float = 0.0
     squares: float = 0.0
-    time: float = -np.inf
+    time: float = -np.inf  # of the last sample (s)
 
     def with_sample(
         self, value: Array, time: float, memory: float, weight: float = 1.0

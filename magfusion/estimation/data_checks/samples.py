@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.inertial_noise import BLOCK
 from magfusion.estimation.data_checks.resolution import (
     is_scheduled,
     reached_in_steps,
@@ -36,29 +37,18 @@ LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
 AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
 EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
-BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
 
 
 class InstrumentStream(NamedTuple):
-    """The axes of one instrument.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    value : ndarray, shape (n, axes)
-        In the unit divided by the scale.
-    axes : str
-        Names of its axes.
-    """
+    """The axes of one instrument."""
 
     name: str
-    time: Array
-    value: Array
+    time: Array  # (n,) (s)
+    value: Array  # (n, axes), in the unit divided by the scale
     unit: str
     scale: float = 1.0
-    axes: str = AXES
+    axes: str = AXES  # names of its axes
 
 
 def streams(log: Log) -> tuple[InstrumentStream, ...]:
@@ -215,11 +205,7 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     """Return the number of samples (n,) at an upper limit, and the limit; zero without one.
 
     Samples reach a limit far more often than the values just below it, and over twice in a row.
-
-    Parameters
-    ----------
-    largest : float
-        Of all axes: an axis that nearly always has this value is at its limit, too.
+    `largest`: of all axes: an axis that nearly always has this value is at its limit, too.
     """
     limit = float(np.max(value))
     at = value == limit
@@ -257,24 +243,13 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
 
 
 class Deviations(NamedTuple):
-    """Deviations of samples from their neighbours.
+    """Deviations of samples from their neighbours."""
 
-    Parameters
-    ----------
-    off : ndarray, shape (n, axes)
-        Zero where the neighbours do not agree with each other.
-    residual : ndarray, shape (n, axes)
-        From the cubic through the neighbours, of noise as if they were even.
-    widening : ndarray, shape (n, 1)
-        How much larger it may be where they are not.
-    centre : ndarray, shape (n, axes)
-        Mean of the nearest neighbours.
-    """
-
-    off: Array
+    off: Array  # (n, axes), zero where the neighbours do not agree with each other
+    # (n, axes), from the cubic through the neighbours, of noise as if they were even
     residual: Array
-    widening: Array
-    centre: Array
+    widening: Array  # (n, 1), how much larger it may be where they are not
+    centre: Array  # (n, axes), mean of the nearest neighbours
 
     def size(self, scatter: Array) -> Array:
         """Return deviations relative to the scatter of residuals, the largest axis, shape (n,)."""

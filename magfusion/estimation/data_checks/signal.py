@@ -14,7 +14,7 @@ from magfusion.model.noise import sensor_positions, whitening
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import LISTED, Finding, Verdict
 from magfusion.receiver.receivers import received, usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
@@ -27,7 +27,6 @@ FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
 NEAR = 10  # epochs beside a silence that it is compared with
 EDGE = 3  # epochs in which the field of a beacon that is switched off falls
 LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
-LISTED = 3
 CERTAIN_DETECTION_RATIO = (
     3.0  # times the weakest detectable field: beyond, one of many beacons must be detected
 )
@@ -36,49 +35,28 @@ SAME_WINDOW = 1e-6  # s; between the centres of identical windows
 
 @dataclass(frozen=True, eq=False)
 class BeaconDetection:
-    """Reception of the beacons.
+    """Reception of the beacons."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    beacons : tuple of str
-    snr : ndarray, shape (n, beacons)
-        Amplitude of the strongest tone over its noise, a component each; NaN where it is missing.
-    amplitude : ndarray, shape (n, beacons)
-        Of all its tones (T), including noise.
-    strong : bool ndarray, shape (n, beacons)
-        Whether it is detected.
-    across : bool
-        Whether components are missing: a field perpendicular to the others looks like silence.
-    passed_by : bool
-        Whether there are so many beacons that each is out of range for a while, so that the end
-        of its signal need not be a fault.
-    """
-
-    time: Array
+    time: Array  # (n,) (s)
     beacons: tuple[str, ...]
+    # (n, beacons), amplitude of the strongest tone over its noise, a component each; NaN where it
+    # is missing
     snr: Array
-    amplitude: Array
-    strong: BoolArray
+    amplitude: Array  # (n, beacons), of all its tones (T), including noise
+    strong: BoolArray  # (n, beacons), whether it is detected
+    # whether components are missing: a field perpendicular to the others looks like silence
     across: bool = False
+    # whether there are so many beacons that each is out of range for a while, so that the end of
+    # its signal need not be a fault
     passed_by: bool = False
 
 
 class Detected(NamedTuple):
-    """Which beacons are detected in phasors that are compensated for motion.
+    """Which beacons are detected in phasors that are compensated for motion."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    beacons : tuple of str
-    strong : bool ndarray, shape (n, beacons)
-    """
-
-    time: Array
+    time: Array  # (n,) (s)
     beacons: tuple[str, ...]
-    strong: BoolArray
+    strong: BoolArray  # (n, beacons)
 
 
 def detect_beacons(samples: FieldSamples, site: Site) -> BeaconDetection:
@@ -136,12 +114,8 @@ def detected_in(samples: FieldSamples, site: Site) -> Detected:
 def with_motion_compensation(raw: BeaconDetection, compensated: Detected) -> BeaconDetection:
     """Return the reception with the motion inside the windows compensated.
 
-    Parameters
-    ----------
-    raw : BeaconDetection
-        With that motion in the noise.
-    compensated : Detected
-        By a solution; those of its windows that are among ``raw``'s count.
+    `raw`: with that motion in the noise. `compensated`: by a solution; those of its windows that
+    are among ``raw``'s count.
     """
     if len(compensated.time) == 0:
         return raw
@@ -160,11 +134,7 @@ def within_reach(
     """Return the reception of those of many beacons that are detected at all, or must be.
 
     A beacon must be detected where even its weakest field at that distance is far above the noise.
-
-    Parameters
-    ----------
-    poses : Trajectory, optional
-        Reliable poses at some epochs; None where unknown.
+    `poses`: reliable poses at some epochs; None where unknown.
     """
     due = np.zeros(len(detection.beacons), dtype=bool)
     if poses is not None and not has_schedule(site):
@@ -199,10 +169,8 @@ def undetected_findings(
 ) -> Iterator[Finding]:
     """Yield the beacons that are silent, always or for a while, and epochs without any beacon.
 
-    Parameters
-    ----------
-    aided : bool
-        Whether another sensor measures the motion, so that epochs without a beacon are no doubt.
+    `aided`: whether another sensor measures the motion, so that epochs without a beacon are no
+    doubt.
     """
     if len(detection.time) == 0:
         return

@@ -35,17 +35,10 @@ ALIASED = 3  # harmonics of the mains whose aliases are searched
 
 
 class Spectrum(NamedTuple):
-    """Mean power spectrum of a field.
+    """Mean power spectrum of a field."""
 
-    Parameters
-    ----------
-    frequency_hz : ndarray, shape (n,)
-    power : ndarray, shape (n,)
-        Squared amplitude of a line in the middle of the bin, over all axes (T^2).
-    """
-
-    frequency_hz: Array
-    power: Array
+    frequency_hz: Array  # (n,)
+    power: Array  # (n,), squared amplitude of a line in the middle of the bin, over all axes (T^2)
     rate_hz: float
 
     @property

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from magfusion.estimation.data_checks.inertial_noise import BLOCK
 from magfusion.estimation.data_checks.resolution import step_of_axes
 from magfusion.estimation.data_checks.samples import (
-    BLOCK,
     CERTAIN_SPIKE,
     SPIKE,
     InstrumentStream,
@@ -27,18 +27,8 @@ class SpikeFilter:
     """Leaves isolated false samples out of a stream.
 
     A sample that those before it predict passes at once; another waits for the next two.
-
-    Parameters
-    ----------
-    instruments : tuple of str
-        Of three columns each, as in `InstrumentStream`.
-    patient : bool
-        Whether the first samples wait until they can be tested.
-
-    Attributes
-    ----------
-    left_out : int
-        False samples so far.
+    `instruments`: of three columns each, as in `InstrumentStream`. `patient`: whether the first
+    samples wait until they can be tested. `left_out`: false samples so far.
     """
 
     def __init__(self, instruments: tuple[str, ...], site: Site, *, patient: bool = True) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import LISTED, Finding, Verdict
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, IntArray
@@ -22,47 +22,28 @@ MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
 MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
 MIN_LOST_SHARE = 1e-3  # that is no error of its rate
-LISTED = 3  # gaps that are listed
 
 
 class Timing(NamedTuple):
-    """Stamps of one stream.
-
-    Parameters
-    ----------
-    stream : str
-    rate_hz : float
-        Of the even clock, or by the median step where there is none.
-    begin, end : float
-        First and last stamp (s).
-    jitter : float
-        Of the stamps about an even clock, root mean square (s).
-    lost_share : float
-        Share of the samples that are missing outside the gaps.
-    gap_begin, gap_end : ndarray, shape (gaps,)
-        (s)
-    resolution : float
-        To which the stamps are rounded (s), where that explains the jitter; otherwise zero.
-    """
+    """Stamps of one stream."""
 
     stream: str
-    rate_hz: float
+    rate_hz: float  # of the even clock, or by the median step where there is none
+    # begin, end: first and last stamp (s)
     begin: float
     end: float
-    jitter: float
-    lost_share: float
-    gap_begin: Array
-    gap_end: Array
+    jitter: float  # of the stamps about an even clock, root mean square (s)
+    lost_share: float  # share of the samples that are missing outside the gaps
+    gap_begin: Array  # (gaps,) (s)
+    gap_end: Array  # (gaps,) (s)
+    # to which the stamps are rounded (s), where that explains the jitter; otherwise zero
     resolution: float = 0.0
 
 
 def timing(stream: str, time: Array, bundled: bool = True) -> Timing | None:
     """Return the timing of a stream from its stamps (s); None of fewer than three.
 
-    Parameters
-    ----------
-    bundled : bool
-        As in `sampling_clock`.
+    `bundled`: as in `sampling_clock`.
     """
     if len(time) < 3:
         return None

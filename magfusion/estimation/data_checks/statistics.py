@@ -15,25 +15,20 @@ from magfusion.units import Array, BoolArray
 FALSE_ALARMS = 0.005  # of all tests of one result together
 TEST_FAMILIES = 5  # that share it equally; each applies Holm's procedure to its part
 TEST_BUDGET = FALSE_ALARMS / TEST_FAMILIES
-P_CERTAIN = 1e-9  # probability of six sigma, two-sided: evidence that may fail a result
+P_CERTAIN = 1e-9  # probability of `DETECTION_SIGMAS`, two-sided: evidence that may fail a result
+DETECTION_SIGMAS = 6.0
 # Of the prior's variance; below, a direction has no information from the data.
 MIN_INFORMATION_RATIO = 0.02
 TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are acceptable
+MAD_TO_SIGMA = 1.4826  # standard over median absolute deviation, normal distribution
 _UNDERFLOW = -600.0  # log probability below which the exact function underflows
 
 
 def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
     """Return the logarithm of the probability of a chi square at least this large.
 
-    Parameters
-    ----------
-    value, freedom : float or ndarray
-        The degrees of freedom may be fractional, for correlated numbers.
-
-    Returns
-    -------
-    ndarray
-        Finite for every finite value.
+    `value`, `freedom`: the degrees of freedom may be fractional, for correlated numbers. Returns
+    finite for every finite value.
     """
     value, freedom = np.broadcast_arrays(
         np.maximum(np.asarray(value, dtype=float), 0.0), np.asarray(freedom, dtype=float)
@@ -51,13 +46,8 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
 def largest_mean_square(probability: float, freedom: float, noise_freedom: float) -> float:
     """Return the mean square that chance exceeds with a probability, relative to its expectation.
 
-    Parameters
-    ----------
-    freedom : float
-        Degrees of freedom of the mean square.
-    noise_freedom : float
-        Of its expectation if that is estimated, and the ratio has Fisher's F distribution;
-        infinite if it is known.
+    `freedom`: degrees of freedom of the mean square. `noise_freedom`: of its expectation if that is
+    estimated, and the ratio has Fisher's F distribution; infinite if it is known.
     """
     if np.isinf(noise_freedom):
         return float(chdtri(freedom, probability)) / freedom
@@ -72,10 +62,7 @@ def sigmas(log_p: Array | float) -> Array:
 def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolArray:
     """Return which tests are significant, at a family-wise false-alarm rate of ``budget``.
 
-    Parameters
-    ----------
-    log_p : sequence of float
-        Of all tests, also of insignificant ones.
+    `log_p`: of all tests, also of insignificant ones.
     """
     given = np.asarray(log_p, dtype=float)
     out = np.zeros(len(given), dtype=bool)
@@ -89,16 +76,9 @@ def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolAr
 def effective_number(residual: Array) -> float:
     """Return the effective number of independent samples of a series, from its autocorrelation.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n, ...)
-        Time first; all series are assumed to have the same correlation.  NaN is missing.
-
-    Returns
-    -------
-    float
-        At most n: Bartlett's sum for the variance of a sum of squares, up to where the
-        correlation falls below its own noise.
+    `residual` (n, ...): time first; all series are assumed to have the same correlation. NaN is
+    missing. Returned at most n: Bartlett's sum for the variance of a sum of squares, up to where
+    the correlation falls below its own noise.
     """
     flat = residual.reshape(len(residual), -1)
     known = np.isfinite(flat)

@@ -21,21 +21,12 @@ EXPLAINED = 0.2  # share of the residual that may remain after a rotation about 
 
 
 class OffEarth(NamedTuple):
-    """A static field that is not the Earth's.
-
-    Parameters
-    ----------
-    score : float
-        Deviation in sigmas.
-    turn : float
-        Possible attitude error (rad).
-    of_survey : bool
-        Whether a rotation about the vertical explains it, so that positions may be rotated, too.
-    """
+    """A static field that is not the Earth's."""
 
     finding: Finding
-    score: float
-    turn: float
+    score: float  # deviation in sigmas
+    turn: float  # possible attitude error (rad)
+    # whether a rotation about the vertical explains it, so that positions may be rotated, too
     of_survey: bool
 
     def shift(self, position_world: Array) -> float:
@@ -48,17 +39,9 @@ class OffEarth(NamedTuple):
 def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEarth | None:
     """Test the mean static field against the declared Earth field.
 
-    Parameters
-    ----------
-    left_world : ndarray, shape (3,)
-        Measured less declared, at the estimated attitudes (T).
-    rotation_cov_world : ndarray, shape (3, 3)
-        Of those attitudes, world axes (rad^2).
-
-    Returns
-    -------
-    OffEarth, optional
-        None where it agrees, or none is declared.
+    `left_world` (3,): measured less declared, at the estimated attitudes (T).
+    `rotation_cov_world` (3, 3): of those attitudes, world axes (rad^2). Returns None where it
+    agrees, or none is declared.
     """
     earth = site.earth_field_world
     if earth is None:

@@ -19,25 +19,16 @@ FULL = 0.8  # share of a span's samples that must exist
 
 @dataclass(frozen=True, eq=False)
 class StillMeans:
-    """Specific force and field, averaged over spans in gyro-stabilized axes.
+    """Specific force and field, averaged over spans in gyro-stabilized axes."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Middle of each span, on the log's clock (s).
-    force_body, field_body : ndarray, shape (n, 3)
-        In body axes at that time (m/s^2, T); the field is NaN where none was measured.
-    still_from_body : ndarray, shape (n, 3, 3)
-        Attitude at that time, integrated from the gyroscope since the log's first sample.
-    attitude : callable
-        The same at other times, quaternions, as of `body_turn_of`.
-    """
-
-    time: Array
+    time: Array  # (n,), middle of each span, on the log's clock (s)
+    # force_body, field_body: (n, 3), in body axes at that time (m/s^2, T); the field is NaN where
+    # none was measured
     force_body: Array
     field_body: Array
+    # (n, 3, 3), attitude at that time, integrated from the gyroscope since the log's first sample
     still_from_body: Array
-    attitude: Callable[[Array], Array]
+    attitude: Callable[[Array], Array]  # the same at other times, quaternions, as of `body_turn_of`
 
     def __len__(self) -> int:
         return len(self.time)
@@ -50,12 +41,8 @@ class StillMeans:
     def near(self, poses: Trajectory, limit: float) -> tuple[IntArray, IntArray, Array]:
         """Return the spans with a pose nearer than a limit (s), these poses, and attitudes.
 
-        Returns
-        -------
-        spans, poses : ndarray, shape (m,)
-            Rows.
-        world_from_body : ndarray, shape (m, 3, 3)
-            At the middle of each span: that of the pose, rotated by the gyroscope.
+        Returns `spans`, `poses` (m,): rows; `world_from_body` (m, 3, 3): at the middle of each
+        span: that of the pose, rotated by the gyroscope.
         """
         nothing = np.zeros(0, dtype=np.int64)
         if not len(poses) or not len(self):

@@ -14,18 +14,8 @@ LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams means a
 def check_clock(name: str, time: Array, newest: float) -> None:
     """Reject samples after a clock jump, forward or back, or with one among them.
 
-    Parameters
-    ----------
-    name : str
-        Of the stream.
-    time : ndarray, shape (k,)
-    newest : float
-        Newest stamp of all streams (s): a stream that paused for long has not jumped; before any
-        stamp minus infinity.
-
-    Raises
-    ------
-    InputError
+    `name`: of the stream. `time` (k,). `newest`: newest stamp of all streams (s): a stream that
+    paused for long has not jumped; before any stamp minus infinity.
     """
     if len(time) == 0:
         return
@@ -55,12 +45,7 @@ class _Room:
 class Buffer:
     """One stream, sorted by time: stamps with rows of numbers.
 
-    Parameters
-    ----------
-    name : str
-        Of the stream, for error messages.
-    width : int
-        Numbers per row.
+    `name`: of the stream, for error messages. `width`: numbers per row.
     """
 
     newest: float
@@ -81,10 +66,7 @@ class Buffer:
     def add(self, time: Array, rows: Array) -> None:
         """Insert samples, in any order but not before the settled time.
 
-        Raises
-        ------
-        InputError
-            If a number is not finite.
+        Raises InputError if a number is not finite.
         """
         if not (np.isfinite(time).all() and np.isfinite(rows).all()):
             raise InputError(f"{self.name}: a sample is not finite; drop it from the stream")

@@ -24,6 +24,7 @@ from magfusion.estimation.data_checks.spectrum import (
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.receiver.ellipse import semi_axes
+from magfusion.receiver.host_clock import CRYSTAL
 from magfusion.units import Array, ComplexArray
 
 MIN_RELATIVE_STRENGTH = 3e-3  # of the strongest line; a weaker one is not considered a beacon
@@ -32,28 +33,18 @@ LONGEST, SHORTEST = 1.0, 0.25  # s, of a window
 CYCLES_APART = 4.0  # periods of the beat with the nearest line in a window
 # Two equal coils in quadrature draw an ellipse with axes from 1:1 to 1:2, a single one a line.
 ROTATING = 0.25  # ratio of the axes, above which there are two coils
-CRYSTALS = 5e-5  # relative deviation of drive and recorder from the nominal frequency
 ROUND = (1.0, 0.5, 0.1, 0.01)  # Hz; a nominal frequency is a multiple of one of these
 
 
 @dataclass(frozen=True)
 class Tone:
-    """A tone that is probably a beacon's.
+    """A tone that is probably a beacon's."""
 
-    Parameters
-    ----------
-    frequency_hz, sigma_hz : float
-        Measured value and its sigma.
-    amplitude : float
-        (T)
-    roundness : float
-        Median axis ratio of the field's ellipse: 0 for a single coil, 0.5 to 1 for two in
-        quadrature.
-    """
-
+    # frequency_hz, sigma_hz: measured value and its sigma
     frequency_hz: float
     sigma_hz: float
-    amplitude: float
+    amplitude: float  # (T)
+    # median axis ratio of the field's ellipse: 0 for a single coil, 0.5 to 1 for two in quadrature
     roundness: float
 
     @property
@@ -64,7 +55,7 @@ class Tone:
     @property
     def meant_hz(self) -> float:
         """The probable round nominal frequency, or the measured one to a tenth of its sigma."""
-        near = 3.0 * self.sigma_hz + CRYSTALS * self.frequency_hz
+        near = 3.0 * self.sigma_hz + CRYSTAL * self.frequency_hz
         for unit in ROUND:
             meant = round(self.frequency_hz / unit) * unit
             if abs(meant - self.frequency_hz) < min(near, 0.2 * unit):
@@ -83,10 +74,7 @@ class Transmitted:
 def transmitted(log: Log, site: Site | None) -> Transmitted | None:
     """Return the tones of a waveform; None if it is too short for a spectrum.
 
-    Parameters
-    ----------
-    site : Site, optional
-        Only for the magnetometer's mounting; its beacons are ignored.
+    `site`: only for the magnetometer's mounting; its beacons are ignored.
     """
     result = spectrum(log, site)
     if result is None or log.waveform is None:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.turning import (
     CONTRADICTED,
     EXPLAINED,
@@ -27,7 +28,6 @@ LEAST_ANGLE = 6.0 * DEGREE
 # Deviation of the gyroscope's scale from which it is said; iron on the body looks like tenths.
 SCALE = 0.5
 SCALE_EXPLAINED = 0.9  # of the turn by it
-LIMIT = 6.0  # sigma
 
 
 def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
@@ -74,7 +74,8 @@ def _contradicted(found: FieldRotation) -> Iterator[Finding]:
     ranked = sorted(axes(), key=found.explained)[::-1]
     best, explained = ranked[0], found.explained(ranked[0])
     if explained > EXPLAINED and BETTER * (1.0 - explained) < 1.0 - declared:
-        yield _other_axes(found, best, single=_single(found, ranked, explained))
+        single = BETTER * (1.0 - explained) < 1.0 - found.explained(ranked[1])
+        yield _other_axes(found, best, single=single)
     elif found.expected_rate > LEAST_TURN:
         yield Finding(
             "gyro_field",
@@ -100,20 +101,18 @@ def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]
     turn, sigma, better = found.mounting()
     angle = float(np.linalg.norm(turn))
     known = float(np.max(site.platform.magnetometer.sigma.rotation_sensor))
-    if better > BETTER and angle > max(LEAST_ANGLE, LIMIT * float(np.hypot(known, sigma))):
+    least = max(LEAST_ANGLE, DETECTION_SIGMAS * float(np.hypot(known, sigma)))
+    if better > BETTER and angle > least:
+        axis = ", ".join(f"{v:+.2f}" for v in turn / angle)
         yield Finding(
             "mounting",
             f"magnetometer and gyroscope are turned against each other by {angle / DEGREE:.0f} deg"
-            f" from what body_from_sensor declares, about ({_three(turn / angle)}) in body axes: so"
+            f" from what body_from_sensor declares, about ({axis}) in body axes: so"
             f" the turn of the steady field is explained {better:.0f} times better. Correct"
             " rpy_deg of platform.magnetometer.body_from_sensor.",
             Verdict.DOUBTFUL,
             angle / LEAST_ANGLE,
         )
-
-
-def _three(vector: Array) -> str:
-    return ", ".join(f"{v:+.2f}" for v in vector)
 
 
 def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[Finding]:
@@ -138,7 +137,7 @@ def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[
             Verdict.FAILED,
             1e3,
         )
-    elif bias > max(LIMIT * imu.gyro_bias_sigma, 0.5 * said):
+    elif bias > max(DETECTION_SIGMAS * imu.gyro_bias_sigma, 0.5 * said):
         yield Finding(
             "imu_bias",
             f"{words}: a bias of ({', '.join(f'{v:+.3g}' for v in mean)}) rad/s,"
@@ -147,11 +146,6 @@ def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[
             Verdict.DOUBTFUL,
             bias / imu.gyro_bias_sigma,
         )
-
-
-def _single(found: FieldRotation, ranked: list[Array], explained: float) -> bool:
-    """Tell whether the motion tells the best axes from the next."""
-    return BETTER * (1.0 - explained) < 1.0 - found.explained(ranked[1])
 
 
 def _other_clock(

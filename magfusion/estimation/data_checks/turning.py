@@ -25,25 +25,17 @@ CONTRADICTED = 0.5  # explained share of db/dt below which the axes are not thos
 EXPLAINED = 0.7  # by the alternative that is reported
 LONGEST_LAG = 3.0  # s
 LAG_STEP = 0.02  # s
-CORRELATED = 2.0  # consecutive rows that share one residual
+CORRELATED = 2.0  # consecutive rows, of filtered rates or of spans, that share one residual
 _EPSILON = np.zeros((3, 3, 3))
 for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0
 
 
 class FieldRotation(NamedTuple):
-    """Rate of change of a field in body axes, and its prediction by the gyroscope.
+    """Rate of change of a field in body axes, and its prediction by the gyroscope."""
 
-    Parameters
-    ----------
-    change : ndarray, shape (n, 3)
-        db/dt, body axes, as a share of the field (1/s).
-    by_matrix : ndarray, shape (n, 3, 9)
-        Its derivatives by the rows of M.
-    """
-
-    change: Array
-    by_matrix: Array
+    change: Array  # (n, 3), db/dt, body axes, as a share of the field (1/s)
+    by_matrix: Array  # (n, 3, 9), its derivatives by the rows of M
 
     @property
     def speed(self) -> float:
@@ -99,14 +91,8 @@ def turning(
 ) -> FieldRotation:
     """Compare the rotation of a field with the gyroscope's.
 
-    Parameters
-    ----------
-    field_time : ndarray, shape (n,)
-        (s)
-    field_body : ndarray, shape (n, 3)
-        In body axes by the declared calibration and mounting, including tones (T).
-    lag : float
-        Added to the stamps of the inertial samples (s).
+    `field_time` (n,) (s). `field_body` (n, 3): in body axes by the declared calibration and
+    mounting, including tones (T). `lag`: added to the stamps of the inertial samples (s).
     """
     step = float(np.median(np.diff(field_time)))
     time = np.arange(field_time[0], field_time[-1] + 0.5 * step, step)
@@ -183,15 +169,9 @@ def agrees(log: Log, site: Site) -> bool:
 def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
     """Return each column of many values convolved with a kernel.
 
-    As `scipy.signal.fftconvolve`, whose import takes as long as all else.
-
-    Parameters
-    ----------
-    value : ndarray, shape (n, columns)
-    kernel : ndarray, shape (m,)
-        For 'valid', no longer than the values.
-    mode : 'valid' or 'same'
-        Return the values where the kernel fits entirely, or as many as there are.
+    As `scipy.signal.fftconvolve`, whose import takes as long as all else. `value` (n, columns).
+    `kernel` (m,): for 'valid', no longer than the values. `mode`: return the values where the
+    kernel fits entirely, or as many as there are.
     """
     whole = len(value) + len(kernel) - 1
     size = next_fast_len(whole, real=True)

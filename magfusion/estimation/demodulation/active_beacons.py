@@ -17,17 +17,10 @@ SEEN_EVERY = 64  # samples; in fewer no beacon comes much nearer
 
 @dataclass(frozen=True, eq=False)
 class ActiveBeacons:
-    """The beacons that are predicted.
+    """The beacons that are predicted."""
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of all beacons, detected or not.
-    least : float, optional
-        Minimum field of a predicted beacon (T); None where all are predicted.
-    """
-
-    calibration: Calibration
+    calibration: Calibration  # of all beacons, detected or not
+    # minimum field of a predicted beacon (T); None where all are predicted
     least: float | None = None
 
     @staticmethod

@@ -27,12 +27,8 @@ def select_detected(
 ) -> tuple[Log, Site]:
     """Return a log and its site with the beacons it detects, where the site has many.
 
-    Those that are not detected are kept separately (`Site.undetected`).
-
-    Raises
-    ------
-    InputError
-        Where no beacon is detected.
+    Those that are not detected are kept separately (`Site.undetected`). Raises InputError where no
+    beacon is detected.
     """
     known = [beacon.unknown is None for beacon in site.beacons]
     if not are_many(site) or site.undetected or has_schedule(site) or not all(known):

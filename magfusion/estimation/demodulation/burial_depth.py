@@ -40,12 +40,7 @@ def depths_of(samples: FieldSamples, site: Site) -> dict[str, tuple[float, float
 
 
 def refuse_too_deep(samples: FieldSamples, site: Site) -> None:
-    """Raise an error for a log whose fields depend more on the ground than on the position.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for a log whose fields depend more on the ground than on the position."""
     for name, (distance, depths) in depths_of(samples, site).items():
         if depths * np.exp(-0.5 * site.log_conductivity_sigma) > DEEPEST:
             raise InputError(

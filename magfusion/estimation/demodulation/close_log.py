@@ -34,17 +34,11 @@ IGNORED_VARIANCE_FACTOR = 1e6  # times the variance: a window that is tested, bu
 
 
 class CloseLog(NamedTuple):
-    """The short windows of a log.
-
-    Parameters
-    ----------
-    time : ndarray, shape (samples,)
-        Of its waveform (s).
-    """
+    """The short windows of a log."""
 
     receiver: JointReceiver
     windows: Windows
-    time: Array
+    time: Array  # (samples,), of its waveform (s)
 
     @staticmethod
     def of(log: Log, site: Site, requested: LockinSettings | None) -> "CloseLog | None":
@@ -113,10 +107,7 @@ class CloseLog(NamedTuple):
 def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> FieldPhasors:
     """Return phasors with next to no weight where short windows are used instead.
 
-    Parameters
-    ----------
-    window : float
-        Length of the phasors' windows (s), the longest gap of the short ones.
+    `window`: length of the phasors' windows (s), the longest gap of the short ones.
     """
     before = np.ones(phasors.measured.shape[:2]) if phasors.excess is None else phasors.excess
     middle = 0.5 * (joint.time[1:] + joint.time[:-1])
@@ -131,10 +122,7 @@ def without_silent(
 ) -> JointPhasors:
     """Return short windows without beacons that long ones nearby should detect, but do not.
 
-    Parameters
-    ----------
-    samples, states : FieldSamples, Trajectory
-        Of the long windows.
+    `samples`, `states`: of the long windows.
     """
     every = np.ones((*samples.valid.shape, 3), dtype=bool)
     expected = predict_channels(

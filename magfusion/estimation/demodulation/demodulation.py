@@ -42,38 +42,21 @@ REST_EPOCH = 0.5  # s; over which the specific force at rest is averaged
 
 @dataclass(frozen=True, eq=False)
 class Demodulation:
-    """Phasors of a log: a table, or of a waveform that can be demodulated again.
-
-    Parameters
-    ----------
-    fields : FieldSamples
-        The phasors before the motion is known.
-    dropped : mapping
-        Reason to number of windows.
-    receiver : Receiver, optional
-        Of the waveform; None where the log has only phasors.
-    windows : Windows, optional
-        Windows of the receiver.
-    masked : bool ndarray, shape (n, channels), optional
-        Phasors omitted from ``fields`` in which the motion may mask a beacon; None where the log
-        has only phasors.
-    blind : bool ndarray, shape (n,), optional
-        Windows in which the motion from the fields replaces inertial samples.
-    without_turn : Windows
-        Those dropped only for missing inertial samples.
-    close : CloseLog, optional
-        Its short windows, where the tones are close.
-    """
+    """Phasors of a log: a table, or of a waveform that can be demodulated again."""
 
     log: Log
-    fields: FieldSamples
-    dropped: Mapping[str, int]
-    receiver: Receiver | None = None
-    windows: Windows | None = None
+    fields: FieldSamples  # the phasors before the motion is known
+    dropped: Mapping[str, int]  # reason to number of windows
+    receiver: Receiver | None = None  # of the waveform; None where the log has only phasors
+    windows: Windows | None = None  # windows of the receiver
+    # (n, channels), phasors omitted from ``fields`` in which the motion may mask a beacon; None
+    # where the log has only phasors
     masked: BoolArray | None = None
+    # (n,), windows in which the motion from the fields replaces inertial samples
     blind: BoolArray | None = None
+    # those dropped only for missing inertial samples
     without_turn: Windows = field(default_factory=Windows.none)
-    close: CloseLog | None = None
+    close: CloseLog | None = None  # its short windows, where the tones are close
 
     @property
     def can_repeat(self) -> bool:
@@ -83,10 +66,7 @@ class Demodulation:
     def steady(self, calibration: Calibration) -> SteadyFields:
         """Return the Earth field and the offset before the motion is known.
 
-        Raises
-        ------
-        InputError
-            Where the log has only phasors, or time slots.
+        Raises InputError where the log has only phasors, or time slots.
         """
         waveform = self.log.waveform
         if self.receiver is None or waveform is None:
@@ -109,14 +89,8 @@ class Demodulation:
     ) -> MotionCompensated:
         """Return the phasors, compensated for the motion inside the windows.
 
-        A slot is so short that only the gyro's bias matters.
-
-        Parameters
-        ----------
-        states : Trajectory
-            At the centres of the windows.
-        path : Trajectory, optional
-            All states, where these are not those of the windows.
+        A slot is so short that only the gyro's bias matters. `states`: at the centres of the
+        windows. `path`: all states, where these are not those of the windows.
         """
         waveform, imu, offset = self.log.waveform, self.log.imu, calibration.time_offset
         assert waveform is not None
@@ -180,10 +154,8 @@ OFF_GRAVITY = 0.5  # of gravity; a specific force that deviates by more is not i
 def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) -> Demodulation:
     """Return the phasors of a log, demodulated where it has a waveform.
 
-    Raises
-    ------
-    InputError
-        Where no window, or no slot, is usable, or a beacon is too many skin depths away.
+    Raises InputError where no window, or no slot, is usable, or a beacon is too many skin depths
+    away.
     """
     if log.waveform is None:
         if log.fields is None:
@@ -217,12 +189,7 @@ def phasors(
 def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
     """Return the direction of gravity where the platform rests; None if it never does.
 
-    Parameters
-    ----------
-    site : Site
-        Its accelerometer bias limits the accuracy of the direction.
-    time : ndarray, shape (n,)
-        Epochs (s).
+    `site`: its accelerometer bias limits the accuracy of the direction. `time` (n,): epochs (s).
     """
     stamps = imu.time + site.platform.imu.time_offset
     still = resting(stamps, imu.gyro_body, imu.accel_body, motion=site.platform.motion)

@@ -27,12 +27,8 @@ def turning_currents(log: Log, site: Site) -> Log:
     """Return a log in which an encoder's angle is a current: its cosine, of one ampere.
 
     It is used like a current: phasors are referred to it, and the speed may drift within the
-    lock-in's width.
-
-    Raises
-    ------
-    InputError
-        Where an angle is of no rotor of the site, or of one with harmonics, which is no current.
+    lock-in's width. Raises InputError where an angle is of no rotor of the site, or of one with
+    harmonics, which is no current.
     """
     if log.rotation is None:
         return log
@@ -61,10 +57,7 @@ def turning_currents(log: Log, site: Site) -> Log:
 def with_drives(log: Log, site: Site) -> tuple[Log, Site]:
     """Return the log with its findings on drive currents, and a site with these currents.
 
-    Raises
-    ------
-    InputError
-        As `magfusion.receiver.drive.drive_channels`.
+    Raises InputError as `magfusion.receiver.drive.drive_channels`.
     """
     if log.drive is None or not site.beacons:
         return log, site

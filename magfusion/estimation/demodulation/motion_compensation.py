@@ -33,28 +33,17 @@ MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
 
 @dataclass(frozen=True, eq=False)
 class MotionCompensated:
-    """Phasors at the centres of the windows, without the effect of motion inside the window.
-
-    Parameters
-    ----------
-    by_time_offset : complex ndarray, shape (n, channels, 3)
-        Derivative of the removed effect by the IMU's time offset at fixed states (T/s).
-    steady : SteadyFields
-        The Earth field and the offset.
-    unseen : bool
-        Whether the motion was unknown, and nothing was removed.
-    unexplained_sensor : ndarray, shape (samples, 3), optional
-        Samples minus their prediction (T), where requested with ``wanted``.
-    wanted : Trajectory, optional
-        Motion at other times.
-    """
+    """Phasors at the centres of the windows, without the effect of motion inside the window."""
 
     fields: FieldSamples
+    # (n, channels, 3), derivative of the removed effect by the IMU's time offset at fixed states
+    # (T/s)
     by_time_offset: ComplexArray
-    steady: SteadyFields
-    unseen: bool = False
+    steady: SteadyFields  # the Earth field and the offset
+    unseen: bool = False  # whether the motion was unknown, and nothing was removed
+    # (samples, 3), samples minus their prediction (T), where requested with ``wanted``
     unexplained_sensor: Array | None = None
-    wanted: Trajectory | None = None
+    wanted: Trajectory | None = None  # motion at other times
 
     @staticmethod
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
@@ -65,21 +54,15 @@ class MotionCompensated:
 
 
 class TakenOff(NamedTuple):
-    """Residuals of samples after a prediction.
+    """Residuals of samples after a prediction."""
 
-    Parameters
-    ----------
-    unexplained_sensor, change_sensor : ndarray, shape (samples, 3)
-        Residual (T), and the prediction's derivative by the IMU's time offset (T/s).
-    wanted : Trajectory, optional
-        Motion at the other requested times.
-    """
-
+    # unexplained_sensor, change_sensor: (samples, 3), residual (T), and the prediction's derivative
+    # by the IMU's time offset (T/s)
     unexplained_sensor: Array
     change_sensor: Array
     active_beacons: ActiveBeacons
     earth_world: Array
-    wanted: Trajectory | None
+    wanted: Trajectory | None  # motion at the other requested times
 
 
 class KnownMotion(NamedTuple):
@@ -306,16 +289,9 @@ def noisier(
 ) -> FieldSamples:
     """Return phasors with the noise by an error of the motion's shape.
 
-    It is common to all channels: assuming them independent must not average it out.
-
-    Parameters
-    ----------
-    blind : bool ndarray, shape (n,)
-        Windows whose motion was estimated without an IMU.
-    states : Trajectory
-        At their centres.
-    window : float
-        Length of the windows (s).
+    It is common to all channels: assuming them independent must not average it out. `blind` (n,):
+    windows whose motion was estimated without an IMU. `states`: at their centres. `window`: length
+    of the windows (s).
     """
     rows = np.flatnonzero(blind)
     pose = states.world_from_body[rows], states.position_world[rows]

@@ -88,19 +88,12 @@ class _Motion:
 
 @dataclass(frozen=True, eq=False)
 class FieldMotion:
-    """Motion of the platform from the field.
+    """Motion of the platform from the field."""
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        Equivalent IMU samples, at the times of the magnetometer's samples on the log's clock, with
-        the biases of the initial state.
-    path : Trajectory
-        Poses and velocities at the same times.
-    """
-
+    # equivalent IMU samples, at the times of the magnetometer's samples on the log's clock, with
+    # the biases of the initial state
     imu: ImuSamples
-    path: Trajectory
+    path: Trajectory  # poses and velocities at the same times
 
 
 def motion_from_field(

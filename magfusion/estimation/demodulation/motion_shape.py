@@ -31,63 +31,35 @@ AT_ONCE = 1 << 14  # samples that are rotated at once: intermediate results stay
 
 
 class _ByOffset(NamedTuple):
-    """Derivatives by the IMU's time offset, at its samples (n, 3) and at the states.
+    """Derivatives by the IMU's time offset, at its samples (n, 3) and at the states."""
 
-    Parameters
-    ----------
-    rate, rate_at_states : ndarray
-        (rad/s), world axes
-    position, velocity : ndarray
-        (m/s) and (m/s^2)
-    """
-
+    # rate, rate_at_states: (rad/s), world axes
     rate: Array
     rate_at_states: Array
+    # position, velocity: (m/s), and (m/s^2)
     position: Array
     velocity: Array
 
 
 @dataclass(frozen=True, eq=False)
 class MotionShape:
-    """The IMU integrated once over a log, with its errors at the states spread between them.
+    """The IMU integrated once over a log, with its errors at the states spread between them."""
 
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity and biases, at the field epochs.
-    time : ndarray, shape (n,)
-        Of the inertial samples, on the log's clock (s).
-    gyro_body : ndarray, shape (n, 3)
-        Without the bias (rad/s).
-    chain : ndarray, shape (4, n)
-        ``body(0)_from_body(k)``, quaternions, scalar first.
-    world_from_start : ndarray, shape (4, states)
-        At the states.
-    spread : ndarray, shape (3, states - 1)
-        Rotation error spread between each state and the next (rad).
-    world_from_body : ndarray, shape (4, n)
-        At the inertial samples.
-    accel_world, velocity_world, position_world : ndarray, shape (n, 3)
-        As integrated from rest at the origin (m/s^2, m/s, m).
-    reach : int
-        Number of inertial samples on either side over which `changing_at` averages.
-    usual : float
-        Median interval of the inertial samples (s).
-    """
-
-    states: Trajectory
-    time: Array
-    gyro_body: Array
-    chain: Array
-    world_from_start: Array
-    spread: Array
-    world_from_body: Array
+    states: Trajectory  # with velocity and biases, at the field epochs
+    time: Array  # (n,), of the inertial samples, on the log's clock (s)
+    gyro_body: Array  # (n, 3), without the bias (rad/s)
+    chain: Array  # (4, n), ``body(0)_from_body(k)``, quaternions, scalar first
+    world_from_start: Array  # (4, states), at the states
+    spread: Array  # (3, states - 1), rotation error spread between each state and the next (rad)
+    world_from_body: Array  # (4, n), at the inertial samples
+    # accel_world, velocity_world, position_world: (n, 3), as integrated from rest at the origin
+    # (m/s^2, m/s, m)
     accel_world: Array
     velocity_world: Array
     position_world: Array
     gravity: float
-    reach: int
-    usual: float
+    reach: int  # number of inertial samples on either side over which `changing_at` averages
+    usual: float  # median interval of the inertial samples (s)
 
     @staticmethod
     def of(
@@ -100,16 +72,8 @@ class MotionShape:
     ) -> "MotionShape":
         """Integrate an inertial stream through states.
 
-        Parameters
-        ----------
-        time_offset : float
-            (s)
-        gravity : float
-            (m/s^2)
-        reach : int, optional
-            Where the samples are a part of a longer stream.
-        usual : float, optional
-            Usual interval of the samples (s), if known.
+        `time_offset` (s), `gravity` (m/s^2). `reach`: where the samples are a part of a longer
+        stream. `usual`: usual interval of the samples (s), if known.
         """
         if states.velocity_world is None or states.gyro_bias_body is None:
             raise ValueError("states must have velocity and biases")
@@ -155,17 +119,8 @@ class MotionShape:
     def at(self, wanted: Array, rotated: Array | None = None) -> Trajectory:
         """Return the motion at any times.
 
-        Parameters
-        ----------
-        wanted : ndarray, shape (m,)
-            Strictly increasing (s).
-        rotated : ndarray, shape (4, m), optional
-            As of `turned_at`, if known.
-
-        Returns
-        -------
-        Trajectory
-            Pose and velocity.
+        `wanted` (m,): strictly increasing (s). `rotated` (4, m): as of `turned_at`, if known.
+        Returns pose and velocity.
         """
         near, known = self._near(wanted), self.states.time
         path = self.time[near], self.position_world[near], self.velocity_world[near]
@@ -186,14 +141,8 @@ class MotionShape:
 
         The states are fixed, and the stream is delayed: every pose changes by the motion in that
         time, minus the change at the states.  Rate and specific force are averaged (`low_passed`),
-        since white noise in a derivative would appear as information.
-
-        Returns
-        -------
-        Trajectory
-            Pose and velocity.
-        tuple of ndarray, shape (m, 3)
-            Rotation (rad/s) and position (m/s), world axes.
+        since white noise in a derivative would appear as information. Returns pose and velocity;
+        (m, 3) each: rotation (rad/s) and position (m/s), world axes.
         """
         near, known, late = self._near(wanted), self.states.time, self._by_offset
         own, (place, speed) = self.time[near], self._with_change
@@ -287,21 +236,8 @@ def motion_at(
 ) -> Trajectory:
     """Return the motion at any times, interpolated through the states by the IMU.
 
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity and biases, at the field epochs.
-    time_offset : float
-        (s)
-    gravity : float
-        (m/s^2)
-    wanted : ndarray, shape (m,)
-        Strictly increasing (s).
-
-    Returns
-    -------
-    Trajectory
-        Pose and velocity at ``wanted``.
+    `states`: with velocity and biases, at the field epochs. `time_offset` (s), `gravity` (m/s^2).
+    `wanted` (m,): strictly increasing (s). Returns pose and velocity at ``wanted``.
     """
     return MotionShape.of(states, imu, time_offset, gravity).at(wanted)
 

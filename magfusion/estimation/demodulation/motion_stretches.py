@@ -19,23 +19,15 @@ STRETCH = 1 << 17  # samples; a multiple of those that are predicted at once
 
 
 class SampleStretch(NamedTuple):
-    """Consecutive samples.
+    """Consecutive samples."""
 
-    Parameters
-    ----------
-    first, last : int
-        Index of the first sample, and of the one after the last.
-    start, until : float
-        Times that are nearest to them (s).
-    shape : MotionShape
-        Motion in the segment.
-    """
-
+    # first, last: index of the first sample, and of the one after the last
     first: int
     last: int
+    # start, until: times that are nearest to them (s)
     start: float
     until: float
-    shape: MotionShape
+    shape: MotionShape  # motion in the segment
 
     def pieces(self, at_once: int) -> Iterator[slice]:
         """Yield slices of the samples, of at most this length."""
@@ -60,16 +52,8 @@ def stretches(
 ) -> Iterator[SampleStretch]:
     """Yield all samples in consecutive segments.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Of the samples, strictly increasing (s).
-    path : Trajectory
-        States between which the motion is interpolated.
-    time_offset : float
-        Of the IMU (s).
-    gravity : float
-        (m/s^2)
+    `time` (n,): of the samples, strictly increasing (s). `path`: states between which the motion is
+    interpolated. `time_offset`: of the IMU (s). `gravity` (m/s^2).
     """
     if len(time) <= STRETCH:
         yield from only_stretch(time, MotionShape.of(path, imu, time_offset, gravity))

@@ -20,31 +20,21 @@ from magfusion.receiver.windows import LockinSettings
 
 
 class SeparateDemodulation(NamedTuple):
-    """Demodulated samples of several magnetometers.
+    """Demodulated samples of several magnetometers."""
 
-    Parameters
-    ----------
-    log : Log
-        With phasors on the log's clock, in the site's order, instead of the samples or in addition
-        to the cleaned samples.
-    dropped : mapping
-        Reason, with the magnetometer's name, to number of windows.
-    noticed : tuple of Finding
-        Corrections to the samples of each, and how they were demodulated.
-    """
-
+    # with phasors on the log's clock, in the site's order, instead of the samples or in addition to
+    # the cleaned samples
     log: Log
-    dropped: Mapping[str, int]
+    dropped: Mapping[str, int]  # reason, with the magnetometer's name, to number of windows
+    # corrections to the samples of each, and how they were demodulated
     noticed: tuple[Finding, ...]
 
 
 def of_site(log: Log, site: Site) -> Log:
     """Return a log of several magnetometers with those of the site.
 
-    Raises
-    ------
-    InputError
-        Where a name is not in the site, or the site does not declare which magnetometer it has.
+    Raises InputError where a name is not in the site, or the site does not declare which
+    magnetometer it has.
     """
     if not log.waveforms:
         return log
@@ -97,17 +87,9 @@ def demodulated_apart(
 ) -> SeparateDemodulation:
     """Demodulate each magnetometer by its own mounting, matrix and response, at its own stamps.
 
-    Windows are at the same times of the log's clock, and thus form one epoch.
-
-    Parameters
-    ----------
-    repeated : bool
-        Whether to keep the samples, to be demodulated again once the motion is known.
-
-    Raises
-    ------
-    InputError
-        Where no window of a magnetometer is usable, or its temperature matters.
+    Windows are at the same times of the log's clock, and thus form one epoch. `repeated`: whether
+    to keep the samples, to be demodulated again once the motion is known. Raises InputError where
+    no window of a magnetometer is usable, or its temperature matters.
     """
     refuse_warm(site)
     if not has_schedule(site):

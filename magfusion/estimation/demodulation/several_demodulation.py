@@ -22,34 +22,18 @@ from magfusion.units import BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerPart:
-    """Data of one of several magnetometers.
+    """Data of one of several magnetometers."""
 
-    Parameters
-    ----------
-    sensor : int
-        Index among the platform's.
-    rows : int ndarray, shape (n,)
-        Epochs of its phasors.
-    demodulation : Demodulation
-        Of this magnetometer alone, on the log's clock.
-    """
-
-    sensor: int
-    rows: IntArray
-    demodulation: Demodulation
+    sensor: int  # index among the platform's
+    rows: IntArray  # (n,), epochs of its phasors
+    demodulation: Demodulation  # of this magnetometer alone, on the log's clock
 
 
 @dataclass(frozen=True, eq=False)
 class SeveralDemodulation(Demodulation):
-    """Phasors of several magnetometers, by windows at the same times.
+    """Phasors of several magnetometers, by windows at the same times."""
 
-    Parameters
-    ----------
-    parts : tuple of MagnetometerPart
-        Of those that have samples.
-    """
-
-    parts: tuple[MagnetometerPart, ...] = ()
+    parts: tuple[MagnetometerPart, ...] = ()  # of those that have samples
 
     @property
     def can_repeat(self) -> bool:
@@ -90,10 +74,8 @@ def demodulated_several(
 ) -> SeveralDemodulation:
     """Return the phasors of a log with samples of several magnetometers.
 
-    Raises
-    ------
-    InputError
-        As `magfusion.estimation.demodulation.demodulation.demodulated`, with the name.
+    Raises InputError as `magfusion.estimation.demodulation.demodulation.demodulated`, with the
+    name.
     """
     lockin = same_windows(site, settings)
     sensors = [sensor.name for sensor in site.platform.magnetometers]

@@ -23,12 +23,7 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
     """Return a log at its magnetometer's reference temperature, and the site with the remainder.
 
     If a site declares temperature coefficients and the log has no temperature, a finding is added
-    and the reference temperature is assumed.
-
-    Raises
-    ------
-    InputError
-        As `refuse_warm`.
+    and the reference temperature is assumed. Raises InputError as `refuse_warm`.
     """
     refuse_warm(site)
     known = Temperatures() if log.temperatures is None else log.temperatures
@@ -48,12 +43,7 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def refuse_warm(site: Site) -> None:
-    """Raise an error for coefficients of several magnetometers, as records do not name them.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for coefficients of several magnetometers, as records do not name them."""
     several = site.platform.magnetometers if site.platform.further else ()
     warm = [sensor.name for sensor in several if sensor.temperature_model is not None]
     if warm:
@@ -82,12 +72,7 @@ def at_reference_temperature(
 ) -> Array:
     """Return samples of a stream as of `samples_at_reference`, where its temperature is known.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : ndarray, shape (n, 3)
-        (T)
+    `time` (n,) (s), `measured` (n, 3) (T).
     """
     if magnetometer.temperature_model is None or known is None:
         return measured
@@ -108,11 +93,7 @@ def fields_at_reference_temperature(
 def samples_at_reference(measured: Array, degc: Array, magnetometer: Magnetometer) -> Array:
     """Return samples converted to the magnetometer's reference temperature.
 
-    Parameters
-    ----------
-    measured : ndarray, shape (n, 3)
-        (T)
-    degc : ndarray, shape (n,)
+    `measured` (n, 3) (T), `degc` (n,).
     """
     assert magnetometer.temperature_model is not None
     out = np.empty_like(measured)
@@ -129,9 +110,7 @@ def phasors_at_reference(
 ) -> FieldSamples:
     """Return phasors converted to the magnetometer's reference temperature.
 
-    Parameters
-    ----------
-    degc : ndarray, shape (n,)
+    `degc` (n,).
     """
     assert magnetometer.temperature_model is not None
     back = magnetometer.temperature_model.to_reference(magnetometer.matrix, degc)[0][:, None]

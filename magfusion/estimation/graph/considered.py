@@ -14,7 +14,7 @@ from magfusion.model.parameters import Block
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
 
-AT_ONCE = 2e8  # bytes; fixed parameters are processed in groups of this size
+AT_ONCE = 2e8  # bytes; fixed parameters, and variants, are processed in groups of this size
 PER_COLUMN = 400.0  # bytes per parameter and state, in the graph and eliminated
 
 
@@ -61,12 +61,8 @@ def steps_of_others(
 ) -> Iterator[gtsam.VectorValues]:
     """Yield the step of every variable that a unit of each fixed parameter causes.
 
-    One at a time: in a long log all of them take as much memory as the log.
-
-    Parameters
-    ----------
-    count, nuisance : int
-        Number of fixed parameters, and of nuisances of the system, which are zero.
+    One at a time: in a long log all of them take as much memory as the log. `count`, `nuisance`:
+    number of fixed parameters, and of nuisances of the system, which are zero.
     """
     for one in np.eye(count):
         given = gtsam.VectorValues()

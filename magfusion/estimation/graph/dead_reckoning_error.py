@@ -20,14 +20,8 @@ from magfusion.units import Array, BoolArray
 def step_transitions(length: Array, rotation: Array, force_world: Array) -> Array:
     """Return the error transition of steps, shape (..., 15, 15).
 
-    Parameters
-    ----------
-    length : ndarray, shape (...)
-        (s)
-    rotation : ndarray, shape (..., 3, 3)
-        ``world_from_body``.
-    force_world : ndarray, shape (..., 3)
-        Specific force (m/s^2).
+    `length` (...) (s). `rotation` (..., 3, 3): ``world_from_body``. `force_world` (..., 3):
+    specific force (m/s^2).
     """
     dt = length[..., None, None]
     by_turn, by_bias = -dt * skew(force_world), -dt * rotation
@@ -45,14 +39,7 @@ def step_transitions(length: Array, rotation: Array, force_world: Array) -> Arra
 def step_noise(length: Array, imu: ImuModel, gap_bridged: BoolArray) -> Array:
     """Return the covariance added by steps, shape (..., 15, 15).
 
-    Parameters
-    ----------
-    length : ndarray, shape (...)
-        (s)
-    imu : ImuModel
-        Its densities.
-    gap_bridged : bool ndarray, shape (...)
-        Steps in a gap of the stream.
+    `length` (...) (s). `imu`: its densities. `gap_bridged` (...): steps in a gap of the stream.
     """
     gyro = np.where(gap_bridged, max(BRIDGE_GYRO_NOISE, imu.gyro_noise), imu.gyro_noise) ** 2
     accel = np.where(gap_bridged, max(BRIDGE_ACCEL_NOISE, imu.accel_noise), imu.accel_noise) ** 2

@@ -18,23 +18,13 @@ SEGMENT = 1800.0  # s; of a long log, within which drifting parameters are const
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Segments of a long log, each with its own values of the drifting parameters.
+    """Segments of a long log, each with its own values of the drifting parameters."""
 
-    Parameters
-    ----------
-    of_epoch : int ndarray, shape (epochs,)
-        Segment of each epoch; empty where there is one for all.
-    main : int
-        Segment whose values are in the calibration's own variable, with all constant parameters.
-    drifting : int ndarray, shape (k,)
-        Columns of the calibration's tangent vector.
-    sqrt_information : ndarray, shape (segments - 1, k, k)
-        Whitening of the step from each segment to the next.
-    """
-
-    of_epoch: IntArray
+    of_epoch: IntArray  # (epochs,), segment of each epoch; empty where there is one for all
+    # segment whose values are in the calibration's own variable, with all constant parameters
     main: int
-    drifting: IntArray
+    drifting: IntArray  # (k,), columns of the calibration's tangent vector
+    # (segments - 1, k, k), whitening of the step from each segment to the next
     sqrt_information: Array
 
     def __len__(self) -> int:
@@ -91,10 +81,7 @@ ONE_SEGMENT = Segments(_NONE, 0, _NONE, np.zeros((0, 0, 0)))
 def segments_of(time: Array, calibration: Calibration, blocks: tuple[Block, ...]) -> Segments:
     """Return the segments of a log: one where it is short, or no parameter drifts.
 
-    Parameters
-    ----------
-    time : ndarray, shape (epochs,)
-        (s)
+    `time` (epochs,) (s).
     """
     noise = calibration_process_noise(calibration.site, blocks)
     drifting = np.flatnonzero(noise.variance > 0.0)

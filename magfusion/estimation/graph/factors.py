@@ -194,12 +194,8 @@ def _flat(part: Array) -> Array:
 def empty_factor(parts: Sequence[tuple[int, int]], rows: int) -> gtsam.JacobianFactor:
     """Return a factor of zeros, to be filled.
 
-    Parameters
-    ----------
-    parts : sequence of (int, int)
-        Key and width of each variable, in the order of the columns.
-    rows : int
-        To be filled; there may be a few more, which stay zero.
+    `parts`: key and width of each variable, in the order of the columns. `rows`: to be filled;
+    there may be a few more, which stay zero.
     """
     groups = [parts[i : i + 3] for i in range(0, len(parts), 3)]  # no constructor takes more
     graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()

@@ -43,25 +43,14 @@ BIAS_STEP = np.repeat([0.1, 0.01], 3)
 
 @dataclass(frozen=True, eq=False)
 class GraphEstimate:
-    """Variables that the smoother estimates.
-
-    Parameters
-    ----------
-    values : gtsam.Values
-        Pose X(i), velocity V(i) and bias B(i) of each epoch.
-    calibration : Calibration
-        Of the main segment, where a log is long enough for several.
-    segments : tuple of Calibration
-        Of every segment; empty where it is the same in all.
-    own : gtsam.Values, optional
-        Of the own keys of a user's factors; their initial values by default.
-    """
+    """Variables that the smoother estimates."""
 
     __repr__ = short_repr
 
-    values: gtsam.Values
-    calibration: Calibration
-    segments: tuple[Calibration, ...] = ()
+    values: gtsam.Values  # pose X(i), velocity V(i) and bias B(i) of each epoch
+    calibration: Calibration  # of the main segment, where a log is long enough for several
+    segments: tuple[Calibration, ...] = ()  # of every segment; empty where it is the same in all
+    # of the own keys of a user's factors; their initial values by default
     own: gtsam.Values | None = None
 
     def at(self, segment: int) -> Calibration:
@@ -71,40 +60,24 @@ class GraphEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """A sum of squares over the states of a log or of a window.
-
-    Parameters
-    ----------
-    native : gtsam.NonlinearFactorGraph
-        Inertial factors and priors of the motion, linearised by GTSAM.
-    measurements : tuple of Measurement
-        One per kind, for one call each.
-    declared : Calibration, optional
-        Mean of the calibration's prior; None where another factor constrains it.
-    blocks : tuple of Block
-        Calibration parameters that are estimated.
-    links : tuple of Link
-        Of the last inertial factors of ``native``, where parameters act on the inertial stream;
-        their columns are those of ``blocks``, then of the considered parameters.
-    segments : Segments
-        Of a long log in which the calibration drifts.
-    shift : PriorShift, optional
-        Shift of the prior's mean by other uncertain parameters, where other logs made the prior.
-    user : UserFactors, optional
-        Factors of a user's.
-    """
+    """A sum of squares over the states of a log or of a window."""
 
     __repr__ = short_repr
 
+    # inertial factors and priors of the motion, linearised by GTSAM
     native: gtsam.NonlinearFactorGraph
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[Measurement, ...]  # one per kind, for one call each
+    # mean of the calibration's prior; None where another factor constrains it
     declared: Calibration | None
-    blocks: tuple[Block, ...]
+    blocks: tuple[Block, ...]  # calibration parameters that are estimated
     epochs: int
+    # of the last inertial factors of ``native``, where parameters act on the inertial stream; their
+    # columns are those of ``blocks``, then of the considered parameters
     links: tuple[Link, ...] = ()
-    segments: Segments = ONE_SEGMENT
+    segments: Segments = ONE_SEGMENT  # of a long log in which the calibration drifts
+    # shift of the prior's mean by other uncertain parameters, where other logs made the prior
     shift: PriorShift | None = None
-    user: UserFactors | None = None
+    user: UserFactors | None = None  # factors of a user's
     factors: tuple[Factors, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -212,10 +185,7 @@ class Graph:
     ) -> gtsam.GaussianFactorGraph:
         """Return priors and inertial factors at an estimate, with the calibration's columns.
 
-        Parameters
-        ----------
-        by_others : ndarray, shape (intervals, 15, others), optional
-            Whitened columns of considered parameters.
+        `by_others` (intervals, 15, others): whitened columns of considered parameters.
         """
         graph = self.native.linearize(estimate.values)
         count = len(self.links) if by_others is None else len(by_others)

@@ -158,17 +158,11 @@ def fill(jacobians: list[Array], parts: Sequence[Array]) -> None:
 
 
 def whitened_factor(
-    keys: Sequence[int],
-    rows: int,
-    error: ErrorFunction,
-    like: gtsam.noiseModel.Base | None = None,
+    keys: Sequence[int], rows: int, error: ErrorFunction, like: gtsam.noiseModel.Base | None = None
 ) -> gtsam.NoiseModelFactor:
     """Return a factor of a whitened error, computed by a callback of GTSAM's form.
 
-    Parameters
-    ----------
-    like : gtsam.noiseModel.Base, optional
-        Noise with the robust loss of the factor, if any.
+    `like`: noise with the robust loss of the factor, if any.
     """
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Unit.Create(rows)
     if isinstance(like, gtsam.noiseModel.Robust):
@@ -192,12 +186,7 @@ def linear_factor(parts: Sequence[tuple[int, Array]]) -> gtsam.NoiseModelFactor:
 class EpochRows:
     """Rows of a measurement at one epoch, computed once for the factors of all its groups.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        Of one epoch.
-    at : MotionKeys
-        A variable that is not in the values is zero.
+    `measurement`: of one epoch. `at`: a variable that is not in the values is zero.
     """
 
     def __init__(self, measurement: Measurement, keys: CalibrationKeys, at: MotionKeys) -> None:
@@ -244,16 +233,11 @@ class EpochRows:
 
 
 def measurement_factors(
-    measurement: Measurement,
-    keys: CalibrationKeys,
-    values: gtsam.Values,
+    measurement: Measurement, keys: CalibrationKeys, values: gtsam.Values
 ) -> Iterator[gtsam.NoiseModelFactor]:
     """Yield a factor of every group of rows of every epoch that carries information.
 
-    Parameters
-    ----------
-    values : gtsam.Values
-        Those variables are keys of a factor whose derivative is not zero here.
+    `values`: those variables are keys of a factor whose derivative is not zero here.
     """
     for i, epoch in enumerate(measurement.epoch.tolist()):
         motion_keys = MotionKeys(X(epoch), V(epoch), B(epoch))
@@ -270,12 +254,7 @@ def group_factor(
 ) -> gtsam.NoiseModelFactor:
     """Return the factor of a group of rows, with the measurement's robust loss.
 
-    Parameters
-    ----------
-    used : list of int
-        Keys of the factor.
-    components : int
-        Rows of the group.
+    `used`: keys of the factor. `components`: rows of the group.
     """
     loss = shared.measurement.loss
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Unit.Create(components)

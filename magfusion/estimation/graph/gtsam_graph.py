@@ -53,11 +53,7 @@ class GtsamGraph:
 class NativeProblem:
     """The problem of a `Graph` for GTSAM's optimisers.
 
-    Parameters
-    ----------
-    problem : Graph
-    estimate : GraphEstimate
-        Determines which variables a measurement depends on.
+    `estimate`: determines which variables a measurement depends on.
     """
 
     def __init__(self, problem: Graph, estimate: GraphEstimate) -> None:

@@ -117,22 +117,11 @@ def thinned(
 ) -> Increments:
     """Join the steps of the long intervals.
 
-    Parameters
-    ----------
-    accel_bias, gyro_bias : ndarray, shape (epochs, 3)
-        At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
-        rounding.
-    ways : tuple of int
-        Numbers of steps that may be joined to one, falling.  For each interval the one that leaves
-        the fewest steps, but at least ``min_steps``.
-    min_steps : int
-        Minimum number of joined steps of an interval.
-
-    Returns
-    -------
-    Increments
-        The given ones where no interval is long.  Intervals with a gap, steps that fill no pair,
-        and steps of fast rotation are not joined.
+    `accel_bias`, `gyro_bias` (epochs, 3): at which they will be preintegrated (m/s^2, rad/s): there
+    the result is the same to rounding. `ways`: numbers of steps that may be joined to one, falling.
+    For each interval the one that leaves the fewest steps, but at least ``min_steps``. `min_steps`:
+    minimum number of joined steps of an interval. Returns the given ones where no interval is long.
+    Intervals with a gap, steps that fill no pair, and steps of fast rotation are not joined.
     """
     steps = increments.first[1:] - increments.first[:-1]
     steps[increments.gap_bridged] = 0
@@ -198,17 +187,9 @@ def _one_after_the_other(moved: Array) -> Array:
 def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
     """Return the motion in single steps, and the rotation angle of each (rad).
 
-    Parameters
-    ----------
-    steps, bias
-        As of `_joined`.
-
-    Returns
-    -------
-    moved : ndarray, shape (k, 2, n, 5, 5)
-        Rotation, velocity and position from rest at the beginning of the step, and its length: an
-        element of the Galilean group, of which GTSAM's integration is a product.
-    angle : ndarray, shape (k, 2, n)
+    `steps`, `bias`: as of `_joined`. Returns `moved` (k, 2, n, 5, 5): rotation, velocity and
+    position from rest at the beginning of the step, and its length: an element of the Galilean
+    group, of which GTSAM's integration is a product; `angle` (k, 2, n).
     """
     dt = steps[6]
     rotation, gained = (steps[:6] - bias[:, None, None]).reshape(2, 3, *dt.shape) * dt
@@ -277,15 +258,8 @@ def _small_vectors(turn: Array) -> Array:
 def _by_force(rotation: Array) -> Array:
     """Return velocity and position by a constant specific force over a unit of time.
 
-    Parameters
-    ----------
-    rotation : ndarray, shape (3, ...)
-        Rotation vector at a constant rate (rad).
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 6)
-        Integral, and integral of the integral, of the rotation's matrix.
+    `rotation` (3, ...): rotation vector at a constant rate (rad). Returns (..., 3, 6): integral,
+    and integral of the integral, of the rotation's matrix.
     """
     once = skew(np.moveaxis(rotation, 0, -1))
     twice = once @ once

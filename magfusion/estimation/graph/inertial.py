@@ -13,35 +13,23 @@ from magfusion.estimation.graph.preintegration import (
     across_held,
     preintegrate,
 )
-from magfusion.model.parameters import (
-    Block,
-    Calibration,
-    dimension,
-    inertial_blocks,
-    retract,
-)
+from magfusion.estimation.graph.state import MOTION
+from magfusion.model.parameters import Block, Calibration, dimension, inertial_blocks, retract
 from magfusion.model.platform_motion import HeldModel
 from magfusion.model.site import Platform, Site
 from magfusion.units import Array
 
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 STEP = 1e-2  # of a parameter's sigma, of the difference quotient
-ROWS = 15  # of an inertial factor
+ROWS = MOTION  # of an inertial factor
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Data to preintegrate the measurement of one interval again.
+    """Data to preintegrate the measurement of one interval again."""
 
-    Parameters
-    ----------
-    increments : Increments
-        Of this interval alone.
-    accel_bias_body, gyro_bias_body : ndarray, shape (3,)
-        At which they are linearised (m/s^2, rad/s).
-    """
-
-    increments: Increments
+    increments: Increments  # of this interval alone
+    # accel_bias_body, gyro_bias_body: (3,), at which they are linearised (m/s^2, rad/s)
     accel_bias_body: Array
     gyro_bias_body: Array
 
@@ -75,22 +63,14 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """The inertial stream between two states.
-
-    Parameters
-    ----------
-    by_calibration : ndarray, shape (15, dimension), optional
-        Derivative of the factor's whitened error; None where no parameter acts on the stream.
-    calibration : Calibration
-        With which the stream was corrected.
-    steps : Steps, optional
-        Of a link that a checkpoint may have to store.
-    """
+    """The inertial stream between two states."""
 
     measurement: Preintegrated
+    # (15, dimension), derivative of the factor's whitened error; None where no parameter acts on
+    # the stream
     by_calibration: Array | None
-    calibration: Calibration
-    steps: Steps | None = None
+    calibration: Calibration  # with which the stream was corrected
+    steps: Steps | None = None  # of a link that a checkpoint may have to store
 
     def split(self, after: float, site: Site) -> "tuple[Link, Link]":
         """Return the links to and from a new state, some time after the first (s)."""
@@ -138,12 +118,8 @@ def links_between(
 ) -> list[Link]:
     """Return the links between states, differentiated by the parameters that act on the IMU.
 
-    Parameters
-    ----------
-    preintegrate : callable
-        Returns the measurement of every interval, of the stream as a calibration corrects it.
-    states : callable
-        Returns where to differentiate.
+    `preintegrate`: returns the measurement of every interval, of the stream as a calibration
+    corrects it. `states`: returns where to differentiate.
     """
     base = preintegrate(calibration)
     acting = inertial_blocks(blocks)

@@ -19,16 +19,9 @@ def partial_update(
 
     A share of zero is Schmidt's filter: a parameter that is known well enough is considered, not
     estimated, but its uncertainty stays in the covariance of all others (Brink, "Partial-update
-    Schmidt-Kalman filter", J. Guid. Control Dyn. 40(9), 2017).
-
-    Parameters
-    ----------
-    step : ndarray, shape (n,)
-        Of a full update.
-    cov, prior_cov : ndarray, shape (n, n)
-        After a full update, and before it.
-    share : ndarray, shape (n,), optional
-        From zero to one; None for a full update.
+    Schmidt-Kalman filter", J. Guid. Control Dyn. 40(9), 2017). `step` (n,): of a full update.
+    `cov`, `prior_cov` (n, n): after a full update, and before it. `share` (n,): from zero to one;
+    None for a full update.
     """
     if share is None:
         return step, cov
@@ -56,12 +49,7 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
     - ``log_likelihood`` is exact whatever the range of ``S``; filterpy's omits directions with
       less than 2e-10 of the largest variance.
 
-    Parameters
-    ----------
-    size : int
-        Of the error state.
-    share : ndarray, shape (n,), optional
-        As in `partial_update`.
+    `size`: of the error state. `share` (n,): as in `partial_update`.
     """
 
     def __init__(self, size: int, share: Array | None = None) -> None:
@@ -99,12 +87,7 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
     def update_linear(self, z: Array, H: Array, R: Array | None = None) -> None:
         """Update by measurements ``z = H x + noise``.
 
-        Parameters
-        ----------
-        z : ndarray, shape (m,)
-        H : ndarray, shape (m, n)
-        R : ndarray, shape (m, m), optional
-            Identity where rows are whitened.
+        `z` (m,), `H` (m, n). `R` (m, m): identity where rows are whitened.
         """
         self.H, self.dim_z = H, len(z)
         self.R = np.eye(len(z)) if R is None else R
@@ -135,10 +118,7 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
     def update_from_far(self, z: Array, H: Array) -> None:
         """Update by whitened rows as `update_linear`, by QR for an ill-conditioned ``S``.
 
-        Raises
-        ------
-        LinAlgError
-            Where ``P`` is not positive definite.
+        Raises LinAlgError where ``P`` is not positive definite.
         """
         x, cov, size = self.x, self.P, len(self.x)
         information = np.linalg.inv(np.linalg.cholesky(cov))

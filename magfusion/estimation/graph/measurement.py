@@ -26,16 +26,9 @@ ROBUST_WIDTH = {"huber": 1.345, "cauchy": 2.385, "geman-mcclure": 2.385}
 def robust_weight(square: Array, loss: str | None, components: int = 6) -> tuple[Array, Array]:
     """Return weight and loss of squared whitened residual norms.
 
-    Parameters
-    ----------
-    loss : {None, 'huber', 'cauchy', 'geman-mcclure'}
-    components : int
-        Of each residual.
-
-    Returns
-    -------
-    weight, rho : ndarray
-        ``rho`` replaces ``square`` in the cost; ``weight`` is its derivative by ``square``.
+    `loss`: None, 'huber', 'cauchy' or 'geman-mcclure'. `components`: of each residual. Returns
+    `weight`, `rho`: ``rho`` replaces ``square`` in the cost; ``weight`` is its derivative by
+    ``square``.
     """
     if loss is None:
         return np.ones_like(square), square
@@ -53,16 +46,11 @@ def robust_weight(square: Array, loss: str | None, components: int = 6) -> tuple
 
 @dataclass(frozen=True)
 class Loss:
-    """Robust loss of each group of a measurement's rows.
+    """Robust loss of each group of a measurement's rows."""
 
-    Parameters
-    ----------
-    kind : {'huber', 'cauchy', 'geman-mcclure'}
-    repeats : float or ndarray, shape (n, groups)
-        How many epochs count as one measurement; fractions do not reduce outlier rejection.
-    """
-
-    kind: str
+    kind: str  # 'huber', 'cauchy' or 'geman-mcclure'
+    # scalar or (n, groups), how many epochs count as one measurement; fractions do not reduce
+    # outlier rejection
     repeats: Array | float = 1.0
 
     def weighed(self, square: Array, components: int) -> tuple[Array, Array]:
@@ -77,18 +65,11 @@ class Rows:
 
     Each epoch has groups of components; a robust loss weights a group as a whole.  A derivative
     that is None is zero.
-
-    Parameters
-    ----------
-    error : ndarray, shape (n, groups, components)
-        Predicted minus measured.
-    by_pose, by_velocity, by_bias, by_calibration : ndarray, shape (n, groups, components, k), \
-optional
-        In the tangent of `magfusion.estimation.graph.state`: k is 6, 3, 6 and the calibration's
-        size.
     """
 
-    error: Array
+    error: Array  # (n, groups, components), predicted minus measured
+    # by_pose, by_velocity, by_bias, by_calibration: (n, groups, components, k), in the tangent of
+    # `magfusion.estimation.graph.state`: k is 6, 3, 6 and the calibration's size
     by_pose: Array | None = None
     by_velocity: Array | None = None
     by_bias: Array | None = None
@@ -121,14 +102,9 @@ class Measurement(ABC):
 
     Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them.
     Fields that are not compared do not belong to the measurement itself.
-
-    Parameters
-    ----------
-        State index of each row.
-        Which state each row belongs to.
     """
 
-    epoch: IntArray
+    epoch: IntArray  # state index of each row
 
     @abstractmethod
     def linearize(
@@ -136,12 +112,8 @@ class Measurement(ABC):
     ) -> Rows:
         """Return the rows at an estimate.
 
-        Parameters
-        ----------
-        states : States
-            Of the measurement's own epochs, shape (n, ...).
-        blocks : tuple of Block
-            Columns of the calibration's tangent vector.
+        `states`: of the measurement's own epochs, shape (n, ...). `blocks`: columns of the
+        calibration's tangent vector.
         """
 
     def error(self, states: States, calibration: Calibration) -> Array:
@@ -179,10 +151,7 @@ class Measurement(ABC):
 def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) -> list[Measurement]:
     """Return measurements of the same kind as one, evaluated in one call.
 
-    Parameters
-    ----------
-    epochs : iterable of int, optional
-        Of each part, instead of its own.
+    `epochs`: of each part, instead of its own.
     """
     kinds: dict[str, list[tuple[Measurement, IntArray]]] = {}
     for part, epoch in zip(parts, repeat(None) if epochs is None else epochs, strict=False):
@@ -219,12 +188,8 @@ def _compared(kind: type[Measurement]) -> tuple[str, ...]:
 def group_distances(rows: Rows, cov: Array) -> Array:
     """Return the squared Mahalanobis distance of each group's innovation, shape (n, groups).
 
-    Zero where a group is missing.
-
-    Parameters
-    ----------
-    cov : ndarray, shape (15 + calibration, 15 + calibration)
-        Of the predicted state.
+    Zero where a group is missing. `cov` (15 + calibration, 15 + calibration): of the predicted
+    state.
     """
     jacobian = rows.jacobian(len(cov) - MOTION)
     across = sparse_if_wide(jacobian.reshape(-1, len(cov))) @ cov

@@ -29,25 +29,13 @@ LONGEST_WHITE = 300.0
 
 @dataclass(frozen=True, eq=False)
 class Increments:
-    """Mean rate and specific force over short steps, cut at the epochs.
+    """Mean rate and specific force over short steps, cut at the epochs."""
 
-    Parameters
-    ----------
-    gyro_body, accel_body : ndarray, shape (steps, 3)
-        (rad/s, m/s^2)
-    dt : ndarray, shape (steps,)
-        (s)
-    first : int ndarray, shape (epochs,)
-        First step after each epoch.
-    gap_bridged : bool ndarray, shape (epochs - 1,)
-        Intervals in which the stream has a gap.
-    """
-
-    gyro_body: Array
-    accel_body: Array
-    dt: Array
-    first: IntArray
-    gap_bridged: BoolArray
+    gyro_body: Array  # (steps, 3) (rad/s)
+    accel_body: Array  # (steps, 3) (m/s^2)
+    dt: Array  # (steps,) (s)
+    first: IntArray  # (epochs,), first step after each epoch
+    gap_bridged: BoolArray  # (epochs - 1,), intervals in which the stream has a gap
 
 
 def cut_at_epochs(
@@ -55,14 +43,9 @@ def cut_at_epochs(
 ) -> Increments:
     """Cut the inertial stream into steps that never straddle an epoch.
 
-    Parameters
-    ----------
-    time_offset : float
-        Added to its stamps to bring them to the log's clock (s).
-    epochs : ndarray, shape (n,)
-        (s); outside the stream its end values are extended.
-    usual : float, optional
-        Sampling interval (s); the median by default, which a part inside a gap does not have.
+    `time_offset`: added to its stamps to bring them to the log's clock (s). `epochs` (n,) (s);
+    outside the stream its end values are extended. `usual`: sampling interval (s); the median by
+    default, which a part inside a gap does not have.
     """
     time = imu.time + time_offset
     known = float(np.median(np.diff(time))) if usual is None else usual
@@ -84,11 +67,7 @@ def cut_at_epochs(
         silent = np.flatnonzero(in_gap(time, grid, known))
         gap_bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(
-        mean[:, :3].copy(),
-        mean[:, 3:].copy(),
-        grid[1:] - grid[:-1],
-        first,
-        gap_bridged,
+        mean[:, :3].copy(), mean[:, 3:].copy(), grid[1:] - grid[:-1], first, gap_bridged
     )
 
 
@@ -132,17 +111,8 @@ def step_means(grid: Array, both: Array) -> Array:
     """Return the rate and specific force of steps, with second-order coning and sculling.
 
     Constant over a step, they turn and accelerate the body as those that change linearly.
-
-    Parameters
-    ----------
-    grid : ndarray, shape (n,)
-        (s)
-    both : ndarray, shape (n, 6)
-        Rate (rad/s) and specific force (m/s^2) at these times, body axes.
-
-    Returns
-    -------
-    ndarray, shape (n - 1, 6)
+    `grid` (n,) (s). `both` (n, 6): rate (rad/s) and specific force (m/s^2) at these times, body
+    axes. Returns (n - 1, 6).
     """
     before, after = both[:-1].T, both[1:].T
     mean = 0.5 * (before + after)
@@ -179,10 +149,7 @@ def _filled(time: Array, edges: Array, gaps: IntArray, epochs: Array, usual: flo
 def bias_walks(imu: ImuModel) -> tuple[float, float]:
     """Return the walks of both biases, gyro first, as large as regular factors need.
 
-    Returns
-    -------
-    tuple of float
-        (rad/s/sqrt(s), m/s^2/sqrt(s))
+    Returns (rad/s/sqrt(s), m/s^2/sqrt(s)).
     """
     return (
         max(imu.gyro_bias_walk, imu.gyro_noise / LONGEST_WHITE),
@@ -222,18 +189,8 @@ def preintegrate(
     """Preintegrate every interval between two epochs on the Galilean group.
 
     GTSAM's default class is first-order on the rotation vector and breaks at one full turn.
-
-    Parameters
-    ----------
-    gravity : float
-        (m/s^2)
-    accel_bias, gyro_bias : ndarray, shape (epochs, 3)
-        At which to linearise (m/s^2, rad/s).
-
-    Returns
-    -------
-    list
-        One for each interval.
+    `gravity` (m/s^2). `accel_bias`, `gyro_bias` (epochs, 3): at which to linearise (m/s^2, rad/s).
+    Returned one for each interval.
     """
     usual = preintegration_parameters(imu, gravity, bridge=False)
     wide = preintegration_parameters(imu, gravity, bridge=True)
@@ -274,17 +231,8 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
 def inertial_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
     """Return `low_passed` samples at some times, without averaging the whole stream.
 
-    Parameters
-    ----------
-    time_offset : float
-        (s)
-    wanted : ndarray, shape (m,)
-        (s); outside the stream its end values are extended.
-
-    Returns
-    -------
-    ndarray, shape (m, 6)
-        Rate and specific force (rad/s, m/s^2).
+    `time_offset` (s). `wanted` (m,) (s); outside the stream its end values are extended. Returns
+    (m, 6): rate and specific force (rad/s, m/s^2).
     """
     both = np.hstack([imu.gyro_body, imu.accel_body])
     return _low_passed_at(imu, both, time_offset, wanted)

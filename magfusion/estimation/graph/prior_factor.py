@@ -12,26 +12,16 @@ from magfusion.units import Array
 
 
 class PriorShift(NamedTuple):
-    """Shift of the mean of a prior from other logs by uncertainties besides the calibration.
+    """Shift of the mean of a prior from other logs by uncertainties besides the calibration."""
 
-    Parameters
-    ----------
-    by_considered : ndarray, shape (dimension, considered)
-        Shift by one sigma of each considered parameter.
-    separate_errors : ndarray, shape (dimension, k)
-        Shift by a unit of each of ``k`` errors that do not affect this log.
-    """
-
-    by_considered: Array
+    by_considered: Array  # (dimension, considered), shift by one sigma of each considered parameter
+    # (dimension, k), shift by a unit of each of ``k`` errors that do not affect this log
     separate_errors: Array
 
     def with_separate_errors(self, spread: Array) -> tuple[Array, Array]:
         """Return a spread with columns for the separate errors, and the shift in these columns.
 
-        Parameters
-        ----------
-        spread : ndarray, shape (uncertain, n)
-            Considered parameters first.
+        `spread` (uncertain, n): considered parameters first.
         """
         between = spread.shape[1] - self.by_considered.shape[1]
         wider = np.pad(spread, ((0, 0), (0, self.separate_errors.shape[1])))

@@ -7,33 +7,20 @@ import numpy as np
 
 from magfusion.model.parameters import Block, Calibration, Parameter
 from magfusion.model.site import Site
-from magfusion.units import Array
-
-HOUR = 3600.0  # s
+from magfusion.units import HOUR, Array
 
 
 @dataclass(frozen=True, eq=False)
 class ProcessNoise:
-    """Random walk of a calibration.
-
-    Parameters
-    ----------
-    variance : ndarray, shape (dimension,)
-        Gain per second.
-    """
+    """Random walk of a calibration."""
 
     blocks: tuple[Block, ...]
-    variance: Array
+    variance: Array  # (dimension,), gain per second
 
     def cov(self, calibration: Calibration, time: float, elapsed: float) -> Array:
         """Return the covariance gained over an interval, shape (dimension, dimension).
 
-        Parameters
-        ----------
-        time : float
-            At its end (s).
-        elapsed : float
-            (s)
+        `time`: at its end (s). `elapsed` (s).
         """
         if not self.variance.any():
             return np.zeros((len(self.variance),) * 2)
@@ -76,10 +63,7 @@ def calibration_process_noise(
 ) -> ProcessNoise:
     """Return the random walk of a calibration; rigidly mounted parts have none.
 
-    Parameters
-    ----------
-    considered : int
-        Number of parameters at the end that are only considered: they are constant.
+    `considered`: number of parameters at the end that are only considered: they are constant.
     """
     parts = [
         np.full(len(b.sigma), b.parameter.walk_per_sqrt_hour(site, b.owner) ** 2 / HOUR)

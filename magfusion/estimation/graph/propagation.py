@@ -6,12 +6,7 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.imu_decimation import thinned
-from magfusion.estimation.graph.inertial import (
-    Link,
-    Steps,
-    inertial_factor,
-    links_between,
-)
+from magfusion.estimation.graph.inertial import Link, Steps, inertial_factor, links_between
 from magfusion.estimation.graph.preintegration import cut_at_epochs
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.state import MOTION, State, values_from
@@ -27,21 +22,12 @@ _AFTER = np.r_[9:15, 15:18, 24:30]
 
 @dataclass(frozen=True, eq=False)
 class Propagated:
-    """Result of a propagation by the inertial stream.
+    """Result of a propagation by the inertial stream."""
 
-    Parameters
-    ----------
-    state : State
-        At the later time, with its propagated covariance.
-    gap_bridged : bool
-        Whether the stream had a gap.
-    transition, noise : ndarray, shape (15 + calibration, 15 + calibration)
-        Of the state's tangent.
-    """
-
-    state: State
+    state: State  # at the later time, with its propagated covariance
     link: Link
-    gap_bridged: bool
+    gap_bridged: bool  # whether the stream had a gap
+    # transition, noise: (15 + calibration, 15 + calibration), of the state's tangent
     transition: Array
     noise: Array
 

@@ -13,12 +13,7 @@ SAME_TIME = 1e-6  # s; stamps that differ by less are of one state
 def at_epochs(time: Array, epochs: Array) -> Array:
     """Return times, each replaced by an epoch that it means.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    epochs : ndarray, shape (m,)
-        In any order, at least one (s).
+    `time` (n,) (s). `epochs` (m,): in any order, at least one (s).
     """
     every = np.sort(epochs)
     row = np.searchsorted(every, time)

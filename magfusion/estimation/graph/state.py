@@ -24,30 +24,18 @@ ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
 @dataclass(frozen=True, eq=False)
 class State(PoseAccess):
-    """Motion and calibration at one time.
-
-    Parameters
-    ----------
-    time : float
-        On the log's clock (s).
-    world_from_body : ndarray, shape (3, 3)
-    position_world, velocity_world : ndarray, shape (3,)
-        (m, m/s)
-    accel_bias_body, gyro_bias_body : ndarray, shape (3,)
-        (m/s^2, rad/s)
-    cov : ndarray, shape (15 + calibration, 15 + calibration)
-    """
+    """Motion and calibration at one time."""
 
     __repr__ = short_repr
 
-    time: float
-    world_from_body: Array
-    position_world: Array
-    velocity_world: Array
-    accel_bias_body: Array
-    gyro_bias_body: Array
+    time: float  # on the log's clock (s)
+    world_from_body: Array  # (3, 3)
+    position_world: Array  # (3,) (m)
+    velocity_world: Array  # (3,) (m/s)
+    accel_bias_body: Array  # (3,) (m/s^2)
+    gyro_bias_body: Array  # (3,) (rad/s)
     calibration: Calibration
-    cov: Array
+    cov: Array  # (15 + calibration, 15 + calibration)
 
     @cached_property
     def pose(self) -> gtsam.Pose3:
@@ -77,10 +65,7 @@ def values_from(
 ) -> gtsam.Values:
     """Return poses X(i), velocities V(i) (m/s) and biases B(i) of some epochs as graph values.
 
-    Parameters
-    ----------
-    bias_body : sequence of ndarray, shape (6,)
-        Of the accelerometer, then of the gyro (m/s^2, rad/s).
+    `bias_body` (6,) each: of the accelerometer, then of the gyro (m/s^2, rad/s).
     """
     step = gtsam.VectorValues()
     for i, (velocity, bias) in enumerate(zip(velocity_world, bias_body, strict=True)):
@@ -137,20 +122,12 @@ def between(reference: State, state: State, blocks: tuple[Block, ...]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """States of several epochs as arrays.
+    """States of several epochs as arrays."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world, velocity_world : ndarray, shape (n, 3)
-        (m, m/s)
-    read_bias : callable
-        Returns accelerometer, then gyro bias, shape (n, 6) (m/s^2, rad/s); few measurements use it.
-    """
-
-    world_from_body: Array
-    position_world: Array
-    velocity_world: Array
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    velocity_world: Array  # (n, 3) (m/s)
+    # returns accelerometer, then gyro bias, shape (n, 6) (m/s^2, rad/s); few measurements use it
     read_bias: Callable[[], Array]
 
     def __len__(self) -> int:

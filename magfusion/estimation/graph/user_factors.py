@@ -30,26 +30,15 @@ def _evaluated() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class UserFactors:
-    """Factors on states at given times, under the user's numbers, and on keys of their own.
-
-    Parameters
-    ----------
-    graph : gtsam.NonlinearFactorGraph
-        On X(j), V(j), B(j) of the j-th time, and on keys of its own.
-    values : gtsam.Values
-        Initial values of its own keys.
-    time : ndarray, shape (times,)
-        (s), ascending.
-    epoch : int ndarray, shape (times,)
-        State index of each time.
-    """
+    """Factors on states at given times, under the user's numbers, and on keys of their own."""
 
     __repr__ = short_repr
 
+    # on X(j), V(j), B(j) of the j-th time, and on keys of its own
     graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    time: Array
-    epoch: IntArray
+    values: gtsam.Values  # initial values of its own keys
+    time: Array  # (times,) (s), ascending
+    epoch: IntArray  # (times,), state index of each time
 
     @classmethod
     def of(
@@ -58,12 +47,7 @@ class UserFactors:
         values: gtsam.Values | None,
         time: Array | Sequence[float],
     ) -> "UserFactors":
-        """Return factors, or one, of which every key is known.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return factors, or one, of which every key is known."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         if isinstance(graph, gtsam.NonlinearFactor):
             single, graph = graph, gtsam.NonlinearFactorGraph()
@@ -150,12 +134,8 @@ class UserFactors:
     def named(self, values: gtsam.Values, own: gtsam.Values | None) -> gtsam.Values:
         """Return an estimate under the user's numbers.
 
-        Parameters
-        ----------
-        values : gtsam.Values
-            Of the states, under the estimator's.
-        own : gtsam.Values, optional
-            Of their own keys; the initial ones by default.
+        `values`: of the states, under the estimator's. `own`: of their own keys; the initial ones
+        by default.
         """
         out = gtsam.Values(self.values if own is None else own)
         for key in self.graph.keyVector():

@@ -29,12 +29,8 @@ def among_all(
 ) -> State:
     """Return a state in the tangent of a whole site; undetected beacons are as declared.
 
-    A start may be of some beacons, of some magnetometers, or of some of both.
-
-    Parameters
-    ----------
-    known : tuple of Block
-        Of its tangent, in order.
+    A start may be of some beacons, of some magnetometers, or of some of both. `known`: of its
+    tangent, in order.
     """
     estimated, considered = settings.blocks(site)
     blocks = (*estimated, *placed(considered, dimension(estimated)))
@@ -57,10 +53,7 @@ def score_among_all(
 ) -> Score:
     """Return the score of a start of some beacons, with the calibration of the whole site.
 
-    Parameters
-    ----------
-    known : tuple of Block
-        Estimated part of its calibration; undetected beacons have no response.
+    `known`: estimated part of its calibration; undetected beacons have no response.
     """
     estimated, _ = settings.blocks(site)
     whole = np.zeros((dimension(estimated), score.by_calibration.shape[1]))

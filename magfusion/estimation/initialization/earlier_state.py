@@ -23,17 +23,10 @@ def with_earlier(
     """Return a first state, improved by the biases and calibration of an earlier state.
 
     Both contain the site's prior, which counts once.  Parameters that each log has for itself, and
-    the rate of a motion prior, do not outlast a silence.  If both states contradict each other,
-    as after an exchange of instruments, the first state is returned unchanged.
-
-    Parameters
-    ----------
-    site : Site
-        The navigator's, whose sigmas are the prior.
-    estimated : tuple of Block
-        The first blocks in the states' tangent.
-    walk : ProcessNoise
-        Of all blocks.
+    the rate of a motion prior, do not outlast a silence.  If both states contradict each other, as
+    after an exchange of instruments, the first state is returned unchanged. `site`: the
+    navigator's, whose sigmas are the prior. `estimated`: the first blocks in the states' tangent.
+    `walk`: of all blocks.
     """
     rows = _lasting(site, estimated)
     if not len(rows):

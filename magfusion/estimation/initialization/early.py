@@ -36,12 +36,8 @@ def next_try(tried: float, start_duration: float) -> float:
 def is_clear(start: OnlineStart | NoStart, *, several: bool = False, last: bool = False) -> bool:
     """Return whether an early start is unambiguous: its rival needed no further comparison.
 
-    Parameters
-    ----------
-    several : bool
-        Whether there are several beacons, without a rival; then all tests must be passed.
-    last : bool
-        Whether it is the last early try: its start may be doubtful, its rival merely rejected.
+    `several`: whether there are several beacons, without a rival; then all tests must be passed.
+    `last`: whether it is the last early try: its start may be doubtful, its rival merely rejected.
     """
     if not isinstance(start, OnlineStart):
         return False

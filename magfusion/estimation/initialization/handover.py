@@ -18,15 +18,8 @@ from magfusion.units import Array
 def last_state(result: Smoothed, considered: tuple[Block, ...] = ()) -> State:
     """Return the smoothed state of the last epoch with its covariance, including calibration.
 
-    Parameters
-    ----------
-    considered : tuple of Block
-        Uncertain parameters that were not estimated, to be considered from then on.
-
-    Returns
-    -------
-    State
-        In the tangent of ``result.blocks``, then of those considered.
+    `considered`: uncertain parameters that were not estimated, to be considered from then on.
+    Returned in the tangent of ``result.blocks``, then of those considered.
     """
     states, last = result.states, len(result.states) - 1
     estimate = result.estimate

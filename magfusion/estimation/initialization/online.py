@@ -46,49 +46,29 @@ START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start uses
 
 @dataclass(frozen=True, eq=False)
 class OnlineStart:
-    """Start of an online estimator.
-
-    Parameters
-    ----------
-    waveform : Waveform, optional
-        Samples for the receiver's start; None where phasors are received.
-    rival_chi_square : float, optional
-        Chi square of the rival above that of this start.
-    trust : Trust
-        Test results of the smoothed beginning.
-    score : Score, optional
-        Of the estimates of the smoothed beginning.
-    extra_lines : LockinSettings, optional
-        Receiver settings where undeclared lines are to be fitted.
-    lines : mapping
-        The same of several magnetometers, by their names.
-    excluded : tuple of str
-        Magnetometers not used for the start, as they are inconsistent with the others.
-    findings : tuple of Finding
-        Their findings, or that magnetometers are inconsistent and the cause is ambiguous.
-    turn, shift : float
-        Increase of the uncertainty of attitude (rad) and position (m), one sigma an axis.
-    shared_offsets : mapping of str to ndarray
-        Variance of estimated parameters, by name, due to considered ones.
-    noise_freedom : mapping of str to float
-        Degrees of freedom of the estimated noise of each beacon's fields.
-    corrections : tuple of Correction
-        What may be wrong with the site, the most likely first.
-    """
+    """Start of an online estimator."""
 
     state: State
-    waveform: Waveform | None
-    rival_chi_square: float | None
-    trust: Trust = field(default_factory=Trust)
-    score: Score | None = None
+    waveform: Waveform | None  # samples for the receiver's start; None where phasors are received
+    rival_chi_square: float | None  # chi square of the rival above that of this start
+    trust: Trust = field(default_factory=Trust)  # test results of the smoothed beginning
+    score: Score | None = None  # of the estimates of the smoothed beginning
+    # turn, shift: increase of the uncertainty of attitude (rad) and position (m), one sigma an axis
     turn: float = 0.0
     shift: float = 0.0
+    # receiver settings where undeclared lines are to be fitted
     extra_lines: LockinSettings | None = None
+    # the same of several magnetometers, by their names
     lines: Mapping[str, LockinSettings] = field(default_factory=dict)
+    # variance of estimated parameters, by name, due to considered ones
     shared_offsets: Mapping[str, Array] = field(default_factory=dict)
+    # degrees of freedom of the estimated noise of each beacon's fields
     noise_freedom: Mapping[str, float] = field(default_factory=dict)
+    # magnetometers not used for the start, as they are inconsistent with the others
     excluded: tuple[str, ...] = ()
+    # their findings, or that magnetometers are inconsistent and the cause is ambiguous
     findings: tuple[Finding, ...] = ()
+    # what may be wrong with the site, the most likely first
     corrections: tuple[Correction, ...] = ()
 
     @property
@@ -100,21 +80,12 @@ class OnlineStart:
 
 @dataclass(frozen=True)
 class NoStart:
-    """Reason why the data give no state yet.
+    """Reason why the data give no state yet."""
 
-    Parameters
-    ----------
-    reason : str
-        One or more sentences.
-    trust : Trust
-        Test results of the smoothed beginning, where these are the reason.
-    corrections : tuple of Correction
-        As of `OnlineStart`.
-    """
-
-    reason: str = "Record longer."
+    reason: str = "Record longer."  # one or more sentences
+    # test results of the smoothed beginning, where these are the reason
     trust: Trust = field(default_factory=Trust)
-    corrections: tuple[Correction, ...] = ()
+    corrections: tuple[Correction, ...] = ()  # as of `OnlineStart`
 
 
 def find_online_start(
@@ -209,29 +180,19 @@ def _possible(
 
 
 class _Beginning(NamedTuple):
-    """The smoothed beginning.
+    """The smoothed beginning."""
 
-    Parameters
-    ----------
-    log, site : Log, Site
-        Without the excluded magnetometers.
-    result, honest : Smoothed
-        Of the estimator, and with sigmas increased by the tests.
-    excluded : tuple of Finding
-        Reasons of excluded magnetometers.
-    causes : tuple of ReleasedFault
-        As of `magfusion.estimation.integrity.judge.JudgedResult`.
-    """
-
+    # log, site: without the excluded magnetometers
     log: Log
     site: Site
+    # result, honest: of the estimator, and with sigmas increased by the tests
     result: Smoothed
     honest: Smoothed
     state: State
     trust: Trust
     score: Score | None
-    excluded: tuple[Finding, ...]
-    causes: tuple[ReleasedFault, ...]
+    excluded: tuple[Finding, ...]  # reasons of excluded magnetometers
+    causes: tuple[ReleasedFault, ...]  # as of `magfusion.estimation.integrity.judge.JudgedResult`
 
 
 def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
@@ -264,12 +225,7 @@ def _start_of(
 ) -> OnlineStart:
     """Return the start from a smoothed beginning.
 
-    Parameters
-    ----------
-    detected : Log
-        The recorded beginning, of all magnetometers.
-    given : LockinSettings, optional
-        Requested lock-in settings.
+    `detected`: the recorded beginning, of all magnetometers. `given`: requested lock-in settings.
     """
     result = estimate.result
     kept = [sensor.name for sensor in estimate.site.platform.magnetometers]

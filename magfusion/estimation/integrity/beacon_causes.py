@@ -17,6 +17,7 @@ from magfusion.estimation.integrity.field_causes import (
 )
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.fix_separation import MIN_DETECTED
 from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import (
     BEACON_POSITION,
@@ -30,7 +31,6 @@ from magfusion.model.parameters import (
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array, BoolArray
 
-FEWEST = 3  # beacons; of two, none can be told to be the wrong one
 SUSPECTS = 2  # beacons that are looked at
 WORSE = 6.0  # times its sigmas, that a survey may be wrong
 SURVEYED = 0.3  # of chi square's freedom, that a survey leaves: snapshots weigh by its sigmas too
@@ -47,7 +47,7 @@ def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     if are_many(site):  # those that are not detected explain nothing
         detected = np.any(above_noise(known.samples, DETECTION_CHI_SQUARE_ONLINE), axis=0)
         names = [names[k] for k in beacons_of(site, detected).tolist()]
-    if len(names) < FEWEST:
+    if len(names) < MIN_DETECTED:
         return
     left = {name: known.without(name) for name in names}
     ranked = sorted(names, key=lambda name: left[name].chi_square / max(left[name].freedom, 1.0))
@@ -73,10 +73,7 @@ def _contradicts(known: Snapshots, left: Snapshots, name: str) -> bool:
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
     """Yield what iron on the body, or another scale of all fields, would explain.
 
-    Parameters
-    ----------
-    steady : float, optional
-        Usual size of the steady field, relative to the Earth's.
+    `steady`: usual size of the steady field, relative to the Earth's.
     """
     free = [(MATRIX, MATRIX.owner, 0.3)]
     if known.excess < MISFIT and not known.rejects(free, tests=1):

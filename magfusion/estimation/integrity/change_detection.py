@@ -192,10 +192,7 @@ def changed(case: Case) -> TestResult:
 def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestResult | None:
     """Return the test of a beacon that changed at a known time (s); None if none explains it.
 
-    Parameters
-    ----------
-    result : Smoothed
-        With the fields of the beacon after that.
+    `result`: with the fields of the beacon after that.
     """
     kinds = (GAIN, BEACON_POSITION, BEACON_ROTATION)
     steps = [_step(kind, name, onset) for kind in kinds]
@@ -240,11 +237,7 @@ def _throughout(case: Case, information: Array, gradient: Array) -> float:
         for fault in suspects(case.result.declared.site, case.score.fixed)
         if (
             result := release_fault(
-                case.pose_cov,
-                case.score,
-                fault,
-                information[own, own],
-                gradient[own],
+                case.pose_cov, case.score, fault, information[own, own], gradient[own]
             )
         )
         is not None

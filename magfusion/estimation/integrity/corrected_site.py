@@ -67,10 +67,7 @@ _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
 def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
     """Return a site with the parameters of a candidate fault moved.
 
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        Of all fixed parameters, in typical errors.
+    `step` (h,): of all fixed parameters, in typical errors.
     """
     if fault.code in (TILT, STRETCH):
         size = np.linalg.lstsq(fault.combine, step, rcond=None)[0]

@@ -13,7 +13,7 @@ from magfusion.estimation.integrity.corrected_site import (
     with_sigmas,
     with_wide_priors,
 )
-from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.fixed_parameter_test import amounts, error_in_words
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
@@ -30,67 +30,37 @@ T = TypeVar("T")
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
 MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
-CAUSE_FIRST = 1e6  # weight
 CORRECTED = " The result is corrected for it."
 REFINED = " The remedy is refined by the inertial data."
 
 
 class Correction(NamedTuple):
-    """A mistake that explains a log.
+    """A mistake that explains a log."""
 
-    Parameters
-    ----------
-    finding : Finding
-        What is wrong.
-    site : Site
-        In which it is undone.
-    fault : named tuple, optional
-        The candidate fault, if it is an incorrect fixed parameter.
-    spread : ndarray, shape (states or 1, 6, 6), optional
-        Covariance of the poses by other mistakes that would explain the log as well.
-    clear : bool
-        Whether snapshots of the fields alone are sure of it.
-    is_estimate : bool
-        Whether they estimate values of parameters, and do not choose among usual mistakes.
-    rival : Correction, optional
-        What is tried instead where the corrected result is contradicted.
-    step : ndarray, shape (h,), optional
-        By which the score moves the fixed parameters, in typical errors.
-    words : str
-        By how much they are wrong, as in the finding.
-    released : tuple of Block
-        Parameters that the corrected solution estimates.
-    """
-
-    finding: Finding
-    site: Site
-    fault: Suspect | None = None
+    finding: Finding  # what is wrong
+    site: Site  # in which it is undone
+    fault: Suspect | None = None  # the candidate fault, if it is an incorrect fixed parameter
+    # (states or 1, 6, 6), covariance of the poses by other mistakes that would explain the log as
+    # well
     spread: Array | None = None
-    clear: bool = False
+    clear: bool = False  # whether snapshots of the fields alone are sure of it
+    # whether they estimate values of parameters, and do not choose among usual mistakes
     is_estimate: bool = False
+    # what is tried instead where the corrected result is contradicted
     rival: "Correction | None" = None
+    # (h,), by which the score moves the fixed parameters, in typical errors
     step: Array | None = None
-    words: str = ""
-    released: tuple[Block, ...] = ()
+    words: str = ""  # by how much they are wrong, as in the finding
+    released: tuple[Block, ...] = ()  # parameters that the corrected solution estimates
 
 
 class Trial(NamedTuple, Generic[T]):
-    """A solution with a corrected site.
-
-    Parameters
-    ----------
-    explains_all : bool
-        Whether no test contradicts it.
-    explains_most : bool
-        Whether a gross mistake is undone, with a small rest.
-    remainder : Correction, optional
-        With the rest that it shows.
-    """
+    """A solution with a corrected site."""
 
     result: T
-    explains_all: bool
-    explains_most: bool
-    remainder: Correction | None
+    explains_all: bool  # whether no test contradicts it
+    explains_most: bool  # whether a gross mistake is undone, with a small rest
+    remainder: Correction | None  # with the rest that it shows
 
 
 def corrections(
@@ -101,14 +71,9 @@ def corrections(
 ) -> list[Correction]:
     """Return what may be corrected, the most likely first.
 
-    Parameters
-    ----------
-    findings : tuple of Finding
-        That of the first cause is among them.
-    causes : tuple of ReleasedFault
-        The cause by the score of fixed parameters, and what explains the log as well.
-    diagnosis : Diagnosis, optional
-        By snapshots of the fields and by the motion.
+    `findings`: that of the first cause is among them. `causes`: the cause by the score of fixed
+    parameters, and what explains the log as well. `diagnosis`: by snapshots of the fields and by
+    the motion.
     """
     result: list[Correction] = []
     if diagnosis is not None and diagnosis.finding.code == QUANTISED:
@@ -159,12 +124,8 @@ def best_trial(
 ) -> T | None:
     """Return the result by the correction that explains a log; None where none does.
 
-    Parameters
-    ----------
-    possible : iterable of Correction
-        The most likely first; a remainder, or a rival of what is contradicted, comes before others.
-    tried : callable
-        Returns the trial of a correction, None where it has no solution.
+    `possible`: the most likely first; a remainder, or a rival of what is contradicted, comes before
+    others. `tried`: returns the trial of a correction, None where it has no solution.
     """
     waiting, best, continues = list(possible), None, False
     for _ in range(MOST_SOLUTIONS):
@@ -203,12 +164,8 @@ def corrected_finding(
 ) -> Finding:
     """Return the reason of a corrected result: with its remedy, and what it explains.
 
-    Parameters
-    ----------
-    declared : Site
-        As given by the user.
-    reasons : iterable of Finding
-        Why the result without the correction is not trustworthy.
+    `declared`: as given by the user. `reasons`: why the result without the correction is not
+    trustworthy.
     """
     known = correction.finding
     codes = (code for f in reasons for code in (f.code, *f.explained))
@@ -272,13 +229,7 @@ def _with_rival_frame(site: Site, correction: Correction, probability: float) ->
     """Return the spread of a correction, with that of the other of two frames.
 
     A turned magnetometer and a turned IMU differ by the frame of the result and the lever arm only.
-
-    Parameters
-    ----------
-    site : Site
-        As declared.
-    probability : float
-        Of the other frame.
+    `site`: as declared. `probability`: of the other frame.
     """
     before, after = (one.platform for one in (site, correction.site))
     one, other = before.magnetometer, after.magnetometer
@@ -327,10 +278,7 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
 def continued(correction: Correction, score: Score | None) -> Correction | None:
     """Return a correction with the rest that the corrected result shows; None if it is small.
 
-    Parameters
-    ----------
-    score : Score, optional
-        Of the corrected result.
+    `score`: of the corrected result.
     """
     rest = _remaining(correction, score)
     if rest is None or rest.chi_square < LITTLE * rest.freedom:

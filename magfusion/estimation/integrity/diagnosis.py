@@ -54,31 +54,20 @@ SEEN = OF_SAMPLES | {
     "undeclared_line",
 }
 CLEAR = 30.0  # ratio of chi square
-FIRST = 1e6  # weight: a cause comes before what it causes
-OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
-OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
+CAUSE_FIRST = 1e6  # weight: a cause comes before what it causes
+OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be beside it
+# But what only says where something is wrong may be of what they show.
+OF_CATCH_ALL = CAUSE_FIRST / 4.0
 
 
 class Diagnosis(NamedTuple):
-    """The mistake that explains a log.
-
-    Parameters
-    ----------
-    site : Site, optional
-        In which it is undone, where it can be.
-    ratio : float
-        Of chi square before to that after.
-    is_estimate : bool
-        Whether it has estimated values of parameters.
-    rival : Diagnosis, optional
-        As of `Explanation`, with its probability.
-    """
+    """The mistake that explains a log."""
 
     finding: Finding
-    site: Site | None
-    ratio: float
-    is_estimate: bool = False
-    rival: "Diagnosis | None" = None
+    site: Site | None  # in which it is undone, where it can be
+    ratio: float  # of chi square before to that after
+    is_estimate: bool = False  # whether it has estimated values of parameters
+    rival: "Diagnosis | None" = None  # as of `Explanation`, with its probability
     rival_probability: float = 0.5
 
     @property
@@ -92,13 +81,8 @@ def diagnosed(
 ) -> Diagnosis | None:
     """Return the cause of what the witnesses say, where one explains the log.
 
-    Parameters
-    ----------
-    trust : Trust
-        What they say; where it is trustworthy, nothing is tried, and only what is clear outweighs
-        steel.
-    settings : LockinSettings, optional
-        Of the estimator.
+    `trust`: what they say; where it is trustworthy, nothing is tried, and only what is clear
+    outweighs steel. `settings`: of the estimator.
     """
     if trust.verdict is Verdict.TRUSTWORTHY:
         return None
@@ -130,7 +114,7 @@ def diagnosed(
 
 def _diagnosis(one: Explanation, text: str, verdict: Verdict, several: bool) -> Diagnosis:
     """Return an explanation as a finding; what several magnetometers share is not undone."""
-    weight = OF_CATCH_ALL if one.catch_all else FIRST
+    weight = OF_CATCH_ALL if one.catch_all else CAUSE_FIRST
     finding = Finding(one.code, text, verdict, weight)
     ratio = one.before / max(one.after, 1e-9)
     return Diagnosis(finding, None if several else one.site, ratio, one.found > 0)
@@ -191,7 +175,7 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     if first is None:
         return trust
     # What only says where something is wrong explains no more than what follows of it there.
-    every = first.code in NOT_MEASURED or (cause is not None and first.weight >= FIRST)
+    every = first.code in NOT_MEASURED or (cause is not None and first.weight >= CAUSE_FIRST)
 
     # Where hardly anything is left, no parameter has changed during the log.
     seen = SEEN - {"changed"} if cause is not None and cause.is_clear else SEEN
@@ -209,10 +193,7 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
 def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
     """Return findings in which the changes of beacons precede, and explain, all others.
 
-    Parameters
-    ----------
-    changes : mapping of str to Finding
-        By name of a beacon that is excluded since then, which its change explains.
+    `changes`: by name of a beacon that is excluded since then, which its change explains.
     """
     if not changes:
         return trust
@@ -223,7 +204,7 @@ def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
     }
     kept = [f for f in kept if f.verdict is not Verdict.DOUBTFUL or f.code not in traces]
     explained = tuple(sorted(traces - {"changed"}))
-    first = (replace(f, weight=FIRST, explained=explained) for f in changes.values())
+    first = (replace(f, weight=CAUSE_FIRST, explained=explained) for f in changes.values())
     return replace(trust, findings=(*kept, *first))
 
 

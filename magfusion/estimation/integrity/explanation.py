@@ -19,41 +19,23 @@ MARGIN = 20.0  # of chi square, over any other cause
 
 @dataclass(frozen=True)
 class Explanation:
-    """One thing that people get wrong, tried on a log.
+    """One thing that people get wrong, tried on a log."""
 
-    Parameters
-    ----------
-    code : str
-        Of `magfusion.model.trust.CODES`.
-    cause, remedy : str
-        Clauses: "the log is explained if ...", and what to do.
-    before, after : float
-        Chi square as declared, and with this explanation.
-    expected : float
-        Degrees of freedom.
-    found : int
-        Parameters that were found to explain it.
-    beacon : str
-        The one beacon in which the mistake is; empty of any other mistake.
-    catch_all : bool
-        Whether it says what contradicts the rest, and not why: so it explains whatever is wrong
-        there, and is no rival of what does say why.
-    site : Site, optional
-        In which the mistake is undone, where it can be.
-    rival : Explanation, optional
-        Another site that explains the motion alike, of the same code: tried where this one fails.
-    """
-
-    code: str
+    code: str  # of `magfusion.model.trust.CODES`
+    # cause, remedy: clauses: "the log is explained if ...", and what to do
     cause: str
     remedy: str
+    # before, after: chi square as declared, and with this explanation
     before: float
     after: float
-    expected: float
-    found: int = 0
-    beacon: str = ""
+    expected: float  # degrees of freedom
+    found: int = 0  # parameters that were found to explain it
+    beacon: str = ""  # the one beacon in which the mistake is; empty of any other mistake
+    # whether it says what contradicts the rest, and not why: so it explains whatever is wrong
+    # there, and is no rival of what does say why
     catch_all: bool = False
-    site: Site | None = None
+    site: Site | None = None  # in which the mistake is undone, where it can be
+    # another site that explains the motion alike, of the same code: tried where this one fails
     rival: "Explanation | None" = None
 
     @property

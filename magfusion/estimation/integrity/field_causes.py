@@ -48,18 +48,13 @@ LENGTH_FACTORS = {
 
 
 class Way(NamedTuple):
-    """A site in which a mistake is undone.
-
-    Parameters
-    ----------
-    by_size : callable, optional
-        The same for another size (2,) of the mistake, relative to this one.
-    """
+    """A site in which a mistake is undone."""
 
     code: str
     cause: str
     remedy: str
     site: Site
+    # the same for another size (2,) of the mistake, relative to this one
     by_size: "Callable[[Array], Way] | None" = None
 
 
@@ -81,8 +76,7 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
         whole = known.of(way.site)
         if one.samples is inverted:
             whole = replace(
-                one,
-                samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor),
+                one, samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor)
             )
         yield Explanation(
             way.code,
@@ -178,10 +172,7 @@ def _ways(site: Site) -> Iterator[Way]:
             _every(site, partial(scaled, factor=1.0 / factor)),
         )
     for words, factor in LENGTH_FACTORS.items():
-        yield Way(
-            *length_cause(words),
-            _every(site, partial(_placed, axes=factor * np.eye(3))),
-        )
+        yield Way(*length_cause(words), _every(site, partial(_placed, axes=factor * np.eye(3))))
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         yield Way(
             "angle_convention",
@@ -216,12 +207,8 @@ def _low_passes(site: Site) -> Iterator[Way]:
 def low_pass(site: Site, tones_hz: Array, near_hz: float, size: Array) -> Way:
     """Return a site whose magnetometer has a low-pass of first order, and a delay.
 
-    Parameters
-    ----------
-    near_hz : float
-        Corner frequency (Hz) that the size refers to.
-    size : ndarray, shape (2,)
-        Logarithm of the corner's ratio to that, and the delay in its radians.
+    `near_hz`: corner frequency (Hz) that the size refers to. `size` (2,): logarithm of the corner's
+    ratio to that, and the delay in its radians.
     """
     corner_hz = near_hz * float(np.exp(size[0]))
     share = tones_hz / corner_hz

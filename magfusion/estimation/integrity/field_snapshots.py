@@ -59,18 +59,11 @@ class JointEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Snapshots:
-    """Phasors of some epochs, with a site that may explain them.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-    calibration : Calibration
-    survey_error : bool
-        Whether the weights include the survey's errors, as if every epoch had its own.
-    """
+    """Phasors of some epochs, with a site that may explain them."""
 
     samples: FieldSamples
     calibration: Calibration
+    # whether the weights include the survey's errors, as if every epoch had its own
     survey_error: bool = True
 
     @property
@@ -127,12 +120,8 @@ class Snapshots:
     ) -> tuple[float, Calibration]:
         """Return chi square and calibration with some parameters estimated besides the poses.
 
-        Parameters
-        ----------
-        parameters : sequence of (Parameter, str, float)
-            With owner, and a sigma that constrains undetermined ones.
-        fixes : Fixes
-            Initial poses.
+        `parameters`: with owner, and a sigma that constrains undetermined ones. `fixes`: initial
+        poses.
         """
         cost, guess, _ = self.minimised(wide_blocks(self.site, parameters), *_best_poses(fixes))
         return cost, guess.calibration

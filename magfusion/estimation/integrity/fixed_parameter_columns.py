@@ -17,24 +17,12 @@ STRETCH = 256  # intervals that are processed at once
 
 
 class InertialColumns(NamedTuple):
-    """Columns of inertial factors, most of which are zero.
+    """Columns of inertial factors, most of which are zero."""
 
-    Parameters
-    ----------
-    of_bias : ndarray, shape (intervals, 15, 6)
-        Derivative of the whitened error by a bias.
-    bias : ndarray, shape (intervals, 6, k)
-        Bias of a typical error, for the columns that are not zero.
-    at : int ndarray, shape (k,)
-        Indices of these columns.
-    number : int
-        Number of all columns.
-    """
-
-    of_bias: Array
-    bias: Array
-    at: IntArray
-    number: int
+    of_bias: Array  # (intervals, 15, 6), derivative of the whitened error by a bias
+    bias: Array  # (intervals, 6, k), bias of a typical error, for the columns that are not zero
+    at: IntArray  # (k,), indices of these columns
+    number: int  # number of all columns
 
     def of(self, some: IntArray | slice) -> Array:
         """Return the columns of some intervals, shape (m, 15, number)."""

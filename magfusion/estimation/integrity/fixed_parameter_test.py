@@ -10,15 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.data_checks.statistics import (
-    sigmas,
-)
+from magfusion.estimation.data_checks.statistics import sigmas
 from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
 from magfusion.estimation.integrity.suspects import (
     STRETCH,
     TILT,
@@ -75,19 +69,11 @@ def check_fixed_parameters(case: Case) -> TestResult:
 
 
 class NamedCause(NamedTuple):
-    """A fixed parameter that a log contradicts.
-
-    Parameters
-    ----------
-    rivals : list of ReleasedFault
-        What explains the log as well.
-    total : ndarray, shape (h,)
-        Its step with those of the causes before it.
-    """
+    """A fixed parameter that a log contradicts."""
 
     cause: ReleasedFault
-    rivals: list[ReleasedFault]
-    total: Array
+    rivals: list[ReleasedFault]  # what explains the log as well
+    total: Array  # (h,), its step with those of the causes before it
 
 
 def causes_of(
@@ -98,12 +84,8 @@ def causes_of(
 ) -> Iterator[NamedCause]:
     """Yield the causes, that with most evidence first; the next is of what remains after its step.
 
-    Parameters
-    ----------
-    candidates : callable
-        Candidate faults by information and gradient.
-    is_cause : callable
-        Whether a fault is a cause after a total step.
+    `candidates`: candidate faults by information and gradient. `is_cause`: whether a fault is a
+    cause after a total step.
     """
     information, gradient = score.with_declared(tolerance=False)
     total, first = np.zeros(len(gradient)), 0.0
@@ -188,7 +170,7 @@ def finding_of(
         cause.code,
         f"The log contradicts {cause.fault.name} as declared: {result}"
         f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
-        f" {_length(position)} and {rotation:.2g} deg,"
+        f" {100.0 * position:.2g} cm and {rotation:.2g} deg,"
         f" {np.sqrt(mean):.1f} times their reported sigma.{_alternatives(rivals)} {remedy}.",
         # A tilt is a rotation of the frame, whatever its size.
         Verdict.FAILED
@@ -228,10 +210,6 @@ def amounts(site: Site, block: Block, step: Array, sigma: Array) -> str:
         f" {step[i] / unit.size:+.3g} ± {sigma[i] / unit.size:.1g} {unit.text}".rstrip()
         for i in order.tolist()
     )
-
-
-def _length(metres: float) -> str:
-    return f"{100.0 * metres:.2g} cm"
 
 
 def _unverified(case: Case, score: Score) -> list[Unverified]:

@@ -27,12 +27,7 @@ from magfusion.estimation.integrity.residual_blocks import (
     inertial,
     together,
 )
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-    scores_of,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate, scores_of
 from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
@@ -53,17 +48,12 @@ R = TypeVar("R", bound=Smoothed)
 
 
 class JudgedResult(NamedTuple, Generic[R]):
-    """A result with an honest covariance, its findings, and the score of fixed parameters.
-
-    Parameters
-    ----------
-    causes : tuple of ReleasedFault
-        The fixed parameter that is wrong, and what explains the log as well.
-    """
+    """A result with an honest covariance, its findings, and the score of fixed parameters."""
 
     result: R
     trust: Trust
     score: Score | None
+    # the fixed parameter that is wrong, and what explains the log as well
     causes: tuple[ReleasedFault, ...] = ()
 
 
@@ -88,10 +78,8 @@ def judge_result(result: R, log: Log) -> tuple[R, Trust]:
 def judged_with_score(result: R, log: Log, online: Site | None = None) -> JudgedResult[R]:
     """Return the same, with the score of all fixed parameters of the result.
 
-    Parameters
-    ----------
-    online : Site, optional
-        Of an estimate that continues the result: its region's steel is tested, and in the score.
+    `online`: of an estimate that continues the result: its region's steel is tested, and in the
+    score.
     """
     log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None

@@ -52,10 +52,7 @@ def cause_of(
 ) -> tuple[Explanation, str] | None:
     """Return the mistake that explains a log, with the sentences that say it.
 
-    Raises
-    ------
-    InputError, EstimationError
-        Where the log holds no field that is usable.
+    Raises InputError, EstimationError where the log holds no field that is usable.
     """
     log, site = logged(log, site)
     part = _part(log)

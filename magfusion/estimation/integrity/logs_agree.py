@@ -9,43 +9,25 @@ from magfusion.estimation.batch.joint import LogInformation, Shared, known_by
 from magfusion.estimation.data_checks.statistics import TEST_BUDGET, TOLERATED, holm, sigmas
 from magfusion.estimation.integrity.priors_of_log import distance
 from magfusion.model.parameters import BeaconParameter
-from magfusion.model.trust import Finding
+from magfusion.model.trust import LISTED, Finding
 from magfusion.units import Array
-
-NAMED = 3  # parameters in a sentence
 
 
 class LogAgreement(NamedTuple):
-    """Result of a comparison of logs.
+    """Result of a comparison of logs."""
 
-    Parameters
-    ----------
-    of_log : tuple of tuple of Finding
-        Of each log: empty, or its contradiction of the others.
-    excess : float
-        Factor by which variances are too small, one where they agree.
-    sigmas : ndarray, shape (logs,)
-        Overall deviation of each log from the others, in sigmas of chance.
-    """
-
+    # of each log: empty, or its contradiction of the others
     of_log: tuple[tuple[Finding, ...], ...]
-    excess: float
-    sigmas: Array
+    excess: float  # factor by which variances are too small, one where they agree
+    sigmas: Array  # (logs,), overall deviation of each log from the others, in sigmas of chance
 
 
 class Deviation(NamedTuple):
-    """Deviation of a log's calibration from that of the other logs.
+    """Deviation of a log's calibration from that of the other logs."""
 
-    Parameters
-    ----------
-    tests : list of (float, int, float)
-        Chi square, freedom and log probability of each block, then of all together.
-    by_block : list of float
-        Largest change of each block, in its own sigmas.
-    """
-
+    # chi square, freedom and log probability of each block, then of all together
     tests: list[tuple[float, int, float]]
-    by_block: list[float]
+    by_block: list[float]  # largest change of each block, in its own sigmas
 
     @property
     def least(self) -> float:
@@ -54,21 +36,13 @@ class Deviation(NamedTuple):
 
 
 def agreement(
-    shared: Shared,
-    names: Sequence[str],
-    deviations: Callable[[list[int]], Sequence[Deviation]],
+    shared: Shared, names: Sequence[str], deviations: Callable[[list[int]], Sequence[Deviation]]
 ) -> LogAgreement:
     """Test every log against the others; report those that contradict, the largest first.
 
     A log that contradicts the others makes each of them contradict the rest: once it is reported,
-    the others are tested without it.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the logs, for the findings.
-    deviations : callable
-        Returns the `deviation` of each log of a pool, given by their numbers.
+    the others are tested without it. `names`: of the logs, for the findings. `deviations`: returns
+    the `deviation` of each log of a pool, given by their numbers.
     """
     pool, excess = list(range(len(names))), 1.0
     findings: list[tuple[Finding, ...]] = [() for _ in names]
@@ -104,14 +78,8 @@ def deviation(
 ) -> Deviation:
     """Return the deviation of a log from the other logs of a pool.
 
-    Parameters
-    ----------
-    total : LogInformation
-        Of all logs of the pool.
-    rest : LogInformation, optional
-        Of the others.
-    at : ndarray, shape (s,)
-        From the declared calibration to the linearisation point.
+    `total`: of all logs of the pool. `rest`: of the others. `at` (s,): from the declared
+    calibration to the linearisation point.
     """
     every = known_by(shared, total, at)
     others = known_by(shared, rest, at)
@@ -129,7 +97,7 @@ def deviation(
 
 def _finding(shared: Shared, name: str, others: list[str], one: Deviation) -> Finding:
     blocks = shared.blocks
-    order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:NAMED]
+    order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:LISTED]
     amounts = ", ".join(f"{blocks[k].name} by {one.by_block[k]:.1f} sigma" for k in order)
     square, freedom, _ = one.tests[-1]
     first = blocks[order[0]]

@@ -14,11 +14,11 @@ from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.data_checks.magnetometers import without_magnetometer
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
+from magfusion.estimation.posterior.separation import SLACK
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk
 
-SLACK = 3.0  # sigma; as of the separation of beacons
 MIN_MISFIT_RATIO = 2.0  # ratio of two misfits, from which one of them is reported
 
 Solve = Callable[[Log, Site], Smoothed]
@@ -38,12 +38,8 @@ def agreed(
 ) -> Agreed:
     """Return a solution without magnetometers that contradict the others.
 
-    Parameters
-    ----------
-    solve : callable
-        Returns the solution of a log and its site.
-    plain : callable
-        The same with noise and model error as declared, so that misfits are comparable.
+    `solve`: returns the solution of a log and its site. `plain`: the same with noise and model
+    error as declared, so that misfits are comparable.
     """
     risk = Risk() if risk is None else risk
     findings: list[Finding] = []

@@ -13,19 +13,13 @@ from magfusion.estimation.integrity.corrected_site import (
     with_magnetometer,
 )
 from magfusion.estimation.integrity.explanation import Explanation
-from magfusion.estimation.integrity.motion_comparison import (
-    SHARED,
-    Compared,
-    Surveyed,
-    compared,
-)
+from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
 GYRO_UNITS = {
     "in degrees per second": DEGREE,
     "in milliradians per second": 1e-3,
@@ -215,9 +209,7 @@ def _accel_scaled(known: Compared, before: float, site: Site) -> Iterator[Explan
     )
 
 
-def _axes(
-    tried: Callable[[str, str, str, Array, Array], Explanation],
-) -> Iterator[Explanation]:
+def _axes(tried: Callable[[str, str, str, Array, Array], Explanation]) -> Iterator[Explanation]:
     for axes in _signed_permutations():
         words = _named(axes)
         if np.allclose(axes, EYE):

@@ -51,45 +51,24 @@ WIDE = {"gyro": 10.0, "accel": 100.0, "tilt": 1.0, "mounting": 3.0, "lever": 10.
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Rotations and accelerations from fixes, and the same from the IMU.
+    """Rotations and accelerations from fixes, and the same from the IMU."""
 
-    Parameters
-    ----------
-    rotation, gyro_turned : ndarray, shape (m, 3)
-        Rotation vectors (rad) over spans (s), in body axes.
-    span : ndarray, shape (m,)
-    turn_sigma : ndarray, shape (m,)
-        (rad)
-    curve_world : ndarray, shape (n, 3)
-        Accelerations of the body (m/s^2).
-    force : ndarray, shape (n, 3, 3, 3)
-        ``force[:, i, j, k]``: weighted mean of ``world_from_body[i, j]`` times axis k of the
-        specific force, so that the axes may be exchanged afterwards (m/s^2).
-    predicted_velocity : ndarray, shape (n, 3, 3)
-        Weighted mean of ``world_from_body``.
-    bent : ndarray, shape (n, 3, 3)
-        Second difference of ``world_from_body`` (1/s^2).
-    curve_sigma : ndarray, shape (n,)
-        (m/s^2)
-    gravity : float
-        (m/s^2)
-    prior : ndarray, shape (14,)
-        Sigmas of `SHARED`.
-    turned_by_survey, curve_by_survey : ndarray, shape (m, 3, k), (n, 3, k)
-        Effect of one sigma of each survey error on the first of each.
-    """
-
+    # rotation, gyro_turned: (m, 3), rotation vectors (rad) over spans (s), in body axes
     rotation: Array
     gyro_turned: Array
-    span: Array
-    turn_sigma: Array
-    curve_world: Array
+    span: Array  # (m,)
+    turn_sigma: Array  # (m,) (rad)
+    curve_world: Array  # (n, 3), accelerations of the body (m/s^2)
+    # (n, 3, 3, 3), ``force[:, i, j, k]``: weighted mean of ``world_from_body[i, j]`` times axis k
+    # of the specific force, so that the axes may be exchanged afterwards (m/s^2)
     force: Array
-    predicted_velocity: Array
-    bent: Array
-    curve_sigma: Array
-    gravity: float
-    prior: Array
+    predicted_velocity: Array  # (n, 3, 3), weighted mean of ``world_from_body``
+    bent: Array  # (n, 3, 3), second difference of ``world_from_body`` (1/s^2)
+    curve_sigma: Array  # (n,) (m/s^2)
+    gravity: float  # (m/s^2)
+    prior: Array  # (14,), sigmas of `SHARED`
+    # turned_by_survey, curve_by_survey: (m, 3, k), (n, 3, k), effect of one sigma of each survey
+    # error on the first of each
     turned_by_survey: Array
     curve_by_survey: Array
 
@@ -164,21 +143,12 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class Surveyed:
-    """Fixes, and the effect of survey errors on all of them.
+    """Fixes, and the effect of survey errors on all of them."""
 
-    Parameters
-    ----------
-    fixes : Fixes
-        Of all epochs, with the site's mounting and lever arm.
-    by_survey : ndarray, shape (n, 6, k)
-        Rotation (rad) and translation (m) in body axes, of one sigma each.
-    window : float
-        Over which a fix averages the position (s).
-    """
-
-    fixes: Fixes
+    fixes: Fixes  # of all epochs, with the site's mounting and lever arm
+    # (n, 6, k), rotation (rad) and translation (m) in body axes, of one sigma each
     by_survey: Array
-    window: float
+    window: float  # over which a fix averages the position (s)
 
 
 def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
@@ -198,10 +168,7 @@ def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
 def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
     """Return the data to compare; None if the log is too short.
 
-    Parameters
-    ----------
-    late : float
-        Delay of the inertial stamps beyond the declared offset (s).
+    `late`: delay of the inertial stamps beyond the declared offset (s).
     """
     fixes, time = known.fixes, known.fixes.time
     stamps = imu.time + site.platform.imu.time_offset - late

@@ -27,12 +27,7 @@ DENSE = 60  # neighbouring epochs that tell a rate
 def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]:
     """Yield what another epoch, or another rate of a clock, would explain.
 
-    Parameters
-    ----------
-    known : Snapshots
-        All of whose drives are declared to be synchronised.
-    every : FieldSamples
-        All epochs of the log.
+    `known`: all of whose drives are declared to be synchronised. `every`: all epochs of the log.
     """
     if not all(beacon.synchronised for beacon in known.site.beacons):
         return

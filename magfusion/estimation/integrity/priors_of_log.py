@@ -83,12 +83,8 @@ def _of_all(square: float, freedom: int, log_p: float) -> Finding:
 def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:
     """Return chi square of some blocks' change, its degrees of freedom and log probability.
 
-    Parameters
-    ----------
-    change : ndarray, shape (dimension,)
-        In sigmas of the prior.
-    cov : ndarray, shape (dimension, dimension)
-        Of the change; directions below `MIN_INFORMATION_RATIO` are ignored.
+    `change` (dimension,): in sigmas of the prior. `cov` (dimension, dimension): of the change;
+    directions below `MIN_INFORMATION_RATIO` are ignored.
     """
     rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
     own = cov[np.ix_(rows, rows)]

@@ -50,32 +50,19 @@ UNEXPLAINED = 3.0  # residual of the fixes, one where noise, model and survey ar
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """Results of a quick check.
-
-    Parameters
-    ----------
-    detected : BeaconDetection, optional
-        None without a site, or where no window can be demodulated.
-    spectrum : Spectrum, optional
-    lines : tuple of SpectralLine, optional
-        All its significant lines, including tones.
-    fixes : Fixes, optional
-        Of a few epochs.
-    depths : mapping
-        Range (m) and skin depths of each detected beacon; empty without a conductor.
-    cause : Diagnosis, optional
-        The mistake that explains the log.
-    """
+    """Results of a quick check."""
 
     trust: Trust
     timings: tuple[Timing, ...]
     means: StillMeans
+    # None without a site, or where no window can be demodulated
     detected: BeaconDetection | None = None
     spectrum: Spectrum | None = None
-    lines: tuple[SpectralLine, ...] | None = None
-    fixes: Fixes | None = None
+    lines: tuple[SpectralLine, ...] | None = None  # all its significant lines, including tones
+    fixes: Fixes | None = None  # of a few epochs
+    # range (m) and skin depths of each detected beacon; empty without a conductor
     depths: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    cause: Diagnosis | None = None
+    cause: Diagnosis | None = None  # the mistake that explains the log
 
     @property
     def fix_residual(self) -> float:

@@ -16,15 +16,8 @@ def of_place(
 ) -> tuple[Finding, ...]:
     """Return the findings on poses of a site with a region or a hemisphere.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    pose_cov : ndarray, shape (n, 6, 6)
-        Rotation, then position; body axes.
+    `time` (n,) (s), `world_from_body` (n, 3, 3), `position_world` (n, 3) (m). `pose_cov` (n, 6, 6):
+    rotation, then position; body axes.
     """
     if site.bounds is None or not len(time):
         return ()

@@ -17,24 +17,16 @@ PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the pri
 
 @dataclass(frozen=True, eq=False)
 class ReleaseGain:
-    """A candidate fault with its parameters estimated.
-
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        In typical errors.
-    direction, information, along : ndarray, shape (h, k), (k,), (k,)
-        Orthogonal combinations of the fixed parameters, the log's information on each, and the
-        gradient along it.
-    chi_square, freedom : float
-        Twice the decrease of the cost.
-    """
+    """A candidate fault with its parameters estimated."""
 
     fault: Suspect
-    step: Array
+    step: Array  # (h,), in typical errors
+    # direction, information, along: (h, k), (k,), (k,), orthogonal combinations of the fixed
+    # parameters, the log's information on each, and the gradient along it
     direction: Array
     information: Array
     along: Array
+    # chi_square, freedom: twice the decrease of the cost
     chi_square: float
     freedom: int
 
@@ -68,18 +60,10 @@ class ReleaseGain:
 
 @dataclass(frozen=True, eq=False)
 class ReleasedFault(ReleaseGain):
-    """The same with its effect on the poses.
+    """The same with its effect on the poses."""
 
-    Parameters
-    ----------
-    moved : ndarray, shape (states, 6)
-        Change of the poses.
-    distance : ndarray, shape (states,)
-        Its square, by the covariance of the poses.
-    """
-
-    moved: Array
-    distance: Array
+    moved: Array  # (states, 6), change of the poses
+    distance: Array  # (states,), its square, by the covariance of the poses
 
     @property
     def is_mistake(self) -> bool:
@@ -99,12 +83,8 @@ class ReleasedFault(ReleaseGain):
 def gains(combine: Array, information: Array, gradient: Array) -> Array:
     """Return `ReleasedFault.gain` of many candidates; zero without information.
 
-    Parameters
-    ----------
-    combine : ndarray, shape (candidates, h, columns)
-        Of each, padded with columns of zeros.
-    information, gradient : ndarray, shape (h, h), (h,)
-        Shared, or one per candidate.
+    `combine` (candidates, h, columns): of each, padded with columns of zeros. `information`,
+    `gradient` (h, h), (h,): shared, or one per candidate.
     """
     across = np.swapaxes(combine, 1, 2)
     value, vector = np.linalg.eigh(across @ information @ combine)

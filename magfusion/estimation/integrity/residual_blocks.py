@@ -55,27 +55,13 @@ AXES = {0: "gyroscope x", 1: "gyroscope y", 2: "gyroscope z"} | {
 
 
 class Misfit(NamedTuple):
-    """Residuals of one kind in one stretch.
+    """Residuals of one kind in one stretch."""
 
-    Parameters
-    ----------
-    name : str
-        Beacon, or axis.
-    rows : bool ndarray, shape (n,)
-        The stretch.
-    square : float
-        Mean, one where all is as declared.
-    log_p : float
-        Logarithm of the probability of this mean by chance.
-    whole : bool
-        Whether the stretch is the whole log.
-    """
-
-    name: str
-    rows: BoolArray
-    square: float
-    log_p: float
-    whole: bool
+    name: str  # beacon, or axis
+    rows: BoolArray  # (n,), the stretch
+    square: float  # mean, one where all is as declared
+    log_p: float  # logarithm of the probability of this mean by chance
+    whole: bool  # whether the stretch is the whole log
 
 
 def blocks_of(time: Array, block: float = BLOCK, maximum: int = MOST_BLOCKS) -> list[BoolArray]:
@@ -90,12 +76,7 @@ def blocks_of(time: Array, block: float = BLOCK, maximum: int = MOST_BLOCKS) -> 
 def misfits(name: str, residual: Array, blocks: list[BoolArray], numbers: float) -> list[Misfit]:
     """Test residuals of one kind in every stretch.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n, ...)
-        NaN where missing.
-    numbers : float
-        Number of independent ones at a time.
+    `residual` (n, ...): NaN where missing. `numbers`: number of independent ones at a time.
     """
     flat = residual.reshape(len(residual), -1)
     known = np.isfinite(flat).any(axis=1)

@@ -34,14 +34,7 @@ from magfusion.estimation.posterior.marginals import is_chain
 from magfusion.estimation.posterior.native_rows import NativeRows
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.estimation.solve.sparse_rows import sparse_if_wide
-from magfusion.model.parameters import (
-    Block,
-    Calibration,
-    dimension,
-    placed,
-    prior_sigma,
-    retract,
-)
+from magfusion.model.parameters import Block, Calibration, dimension, placed, prior_sigma, retract
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
@@ -49,31 +42,18 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score of all fixed parameters, in units of their typical errors.
+    """Score of all fixed parameters, in units of their typical errors."""
 
-    Parameters
-    ----------
-    fixed : tuple of Block
-        Their sigmas are those units.
-    information : ndarray, shape (h, h)
-        Of the fixed parameters, with all estimated ones eliminated.
-    gradient : ndarray, shape (h,)
-        Downhill: a step is the information's inverse times this.
-    spread : ndarray, shape (h, k)
-        A root of the covariance of their errors that the site declares; zero where it declares
-        them known.
-    by_state : ndarray, shape (states, 15 or 6, h)
-        Effect of a unit of them on pose, velocity and biases; or on the pose only.
-    by_calibration : ndarray, shape (dimension, h)
-        Effect of a unit of them on the estimated calibration.
-    """
-
-    fixed: tuple[Block, ...]
-    information: Array
-    gradient: Array
+    fixed: tuple[Block, ...]  # their sigmas are those units
+    information: Array  # (h, h), of the fixed parameters, with all estimated ones eliminated
+    gradient: Array  # (h,), downhill: a step is the information's inverse times this
+    # (h, k), a root of the covariance of their errors that the site declares; zero where it
+    # declares them known
     spread: Array
+    # (states, 15 or 6, h), effect of a unit of them on pose, velocity and biases; or on the pose
+    # only
     by_state: Array
-    by_calibration: Array
+    by_calibration: Array  # (dimension, h), effect of a unit of them on the estimated calibration
 
     @property
     def by_pose(self) -> Array:
@@ -83,16 +63,8 @@ class Score:
     def with_declared(self, *, tolerance: bool) -> tuple[Array, Array]:
         """Let uncertain parameters vary within their declared sigma.
 
-        Parameters
-        ----------
-        tolerance : bool
-            Whether all of them vary within their tolerance, too.
-
-        Returns
-        -------
-        information : ndarray, shape (h, h)
-            Of errors beyond that.
-        gradient : ndarray, shape (h,)
+        `tolerance`: whether all of them vary within their tolerance, too. Returns
+        `information` (h, h): of errors beyond that; `gradient` (h,).
         """
         spread = self.spread
         if tolerance:
@@ -129,17 +101,10 @@ def tolerance_of(fixed: tuple[Block, ...]) -> Array:
 
 
 class Scores(NamedTuple):
-    """The score of all fixed parameters, and of additional ones.
-
-    Parameters
-    ----------
-    fixed : Score
-    every : Score
-        Its responses may be those of the first of its parameters only: see `answered`.
-    """
+    """The score of all fixed parameters, and of additional ones."""
 
     fixed: Score
-    every: Score
+    every: Score  # its responses may be those of the first of its parameters only: see `answered`
 
 
 def scores_of(
@@ -147,14 +112,8 @@ def scores_of(
 ) -> Scores | None:
     """Return the score of all fixed parameters of a result; None if there is nothing to test.
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        As recorded.
-    columns : sequence of Block
-        Additional parameters to test in the same sweep.
-    responses : bool
-        Whether the responses of the states include those to these.
+    `imu`: as recorded. `columns`: additional parameters to test in the same sweep. `responses`:
+    whether the responses of the states include those to these.
     """
     graph = result.graph
     if not graph.measurements or result.fix_response is not None:
@@ -273,10 +232,7 @@ def _declared(result: Smoothed, fixed: tuple[Block, ...]) -> Array:
 def moved_estimate(result: Smoothed, score: Score, step: Array) -> GraphEstimate:
     """Return the estimate after a step of the fixed parameters.
 
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        In typical errors.
+    `step` (h,): in typical errors.
     """
     estimate, change = result.estimate, gtsam.VectorValues()
     for i, own in enumerate(score.by_state @ step):

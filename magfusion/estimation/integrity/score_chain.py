@@ -13,40 +13,25 @@ from magfusion.estimation.posterior.block_tridiagonal_system import (
 )
 from magfusion.estimation.posterior.native_rows import Columns, NativeRows
 from magfusion.estimation.posterior.schur_complement import left_over
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, dimension, placed, prior_sigma
 from magfusion.units import Array
 
-POSE = 6
-
 
 class Responses(NamedTuple):
-    """Effect of a unit of each fixed parameter.
+    """Effect of a unit of each fixed parameter."""
 
-    Parameters
-    ----------
-    by_state : ndarray, shape (states, 15 or 6, h)
-        On pose, velocity and biases; or on the pose only.
-    by_calibration : ndarray, shape (dimension, h)
-        On the estimated calibration.
-    """
-
-    by_state: Array
-    by_calibration: Array
+    by_state: Array  # (states, 15 or 6, h), on pose, velocity and biases; or on the pose only
+    by_calibration: Array  # (dimension, h), on the estimated calibration
 
 
 class FixedParameterResidual(NamedTuple):
-    """Marginal of the fixed parameters, as of `magfusion.estimation.integrity.score.Score`.
+    """Marginal of the fixed parameters, as of `magfusion.estimation.integrity.score.Score`."""
 
-    Parameters
-    ----------
-    information : ndarray, shape (h, h)
-    gradient : ndarray, shape (h,)
-    """
-
-    information: Array
-    gradient: Array
+    information: Array  # (h, h)
+    gradient: Array  # (h,)
 
 
 def left_of_chain(
@@ -83,10 +68,7 @@ def responses_of_chain(
 ) -> Responses | None:
     """Return the effect of a unit of each; None if rounding dominates.
 
-    Parameters
-    ----------
-    known : Responses, optional
-        Of the first fixed ones; then only poses are computed for the others.
+    `known`: of the first fixed ones; then only poses are computed for the others.
     """
     graph = result.graph
     kept = MOTION if known is None else POSE

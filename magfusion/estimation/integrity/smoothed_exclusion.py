@@ -19,19 +19,17 @@ from magfusion.estimation.integrity.smoothed_separation import (
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.protection_levels import protection_levels
-from magfusion.estimation.posterior.separation import Separation, radii
+from magfusion.estimation.posterior.separation import SLACK, Separation, radii
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, uniform_trust
+from magfusion.model.trust import LISTED, Finding, Risk, StateTrust, Trust, Verdict, uniform_trust
 from magfusion.units import Array, BoolArray, IntArray
 
-SLACK = 3.0  # sigma; smaller steps are covered, and no alarm
 UNEXPECTED = 1e-4  # probability of a larger deviation of a field from the others' prediction
 JOINED = 1.0  # s; a shorter gap between two false stretches is false too
 BETTER = 0.8  # of the largest separation, above which an exclusion has not explained it
 MOST_FALSE = 0.9  # share of a log; a beacon that is false for longer is declared wrongly
 LEFT_OUT = 0.1  # robust weight below which a field does not count
 ROUNDS = 3  # of exclusions
-SPANS = 3  # in a sentence
 TOGETHER = 3.0  # s; closer stretches are reported as one
 MIN_LEFT_OUT_EPOCHS = 5  # excluded field epochs of a beacon that are reported; fewer are outliers
 LONGEST_EXCLUSION = 5.0  # s of a beacon; after more, other findings are its traces
@@ -40,21 +38,11 @@ OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
 class SeparatedSmooth(NamedTuple):
-    """A smoothed trajectory after the exclusion of false fields.
+    """A smoothed trajectory after the exclusion of false fields."""
 
-    Parameters
-    ----------
-    result : Smoothed
-        Where an alarm remains, its covariance covers it.
-    states : StateTrust
-        Of each state.
-    trust : Trust
-        Of the whole.
-    """
-
-    result: Smoothed
-    states: StateTrust
-    trust: Trust
+    result: Smoothed  # where an alarm remains, its covariance covers it
+    states: StateTrust  # of each state
+    trust: Trust  # of the whole
 
 
 def separated_smooth(
@@ -98,12 +86,7 @@ def _without_false(
 ) -> tuple[Smoothed, Separation, BoolArray]:
     """Exclude stretches of beacons, one after the other, while that reduces the separation.
 
-    Returns
-    -------
-    result, separated : Smoothed, Separation
-        Without them.
-    out : bool ndarray, shape (n, beacons)
-        The excluded fields.
+    Returns `result`, `separated`: without them; `out` (n, beacons): the excluded fields.
     """
     out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
     for _ in range(ROUNDS):
@@ -127,10 +110,7 @@ def _without_false(
 def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:
     """Return the judgement of each state, after all tests.
 
-    Parameters
-    ----------
-    result : Smoothed
-        With the covariance that they allow.
+    `result`: with the covariance that they allow.
     """
     before, after = separated.result.states.pose_cov, result.states.pose_cov
     assert before is not None
@@ -142,10 +122,7 @@ def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) 
 def states_between(states: StateTrust, known: Trajectory, dense: Trajectory) -> StateTrust:
     """Return the judgement at other times: that of the nearest state, as far as it applies.
 
-    Parameters
-    ----------
-    known : Trajectory
-        Of the states.
+    `known`: of the states.
     """
     if known is dense:
         return states
@@ -287,11 +264,11 @@ def _excluded_findings(
             for a, b in _stretches(np.flatnonzero(out[:, j]), time)
         ]
         lasting = float(np.sum(out[:, j]) * np.median(np.diff(time))) > LONGEST_EXCLUSION
-        more = f" and {len(spans) - SPANS} more times" if len(spans) > SPANS else ""
+        more = f" and {len(spans) - LISTED} more times" if len(spans) > LISTED else ""
         findings.append(
             Finding(
                 "beacon_excluded",
-                f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
+                f"Beacon {names[j]} contradicts the others from {', '.join(spans[:LISTED])}{more}:"
                 f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away,"
                 " so it is excluded there. Check its drive current, and iron or a shield near it.",
                 Verdict.TRUSTWORTHY,

@@ -7,20 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.considered import AT_ONCE
 from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.posterior import block_tridiagonal_system as chains
 from magfusion.estimation.posterior.block_tridiagonal_system import (
     EpochRows,
     block_tridiagonal_system,
     column_groups,
 )
-from magfusion.estimation.posterior.convergence import OPEN_ROTATION
 from magfusion.estimation.posterior.information_contributions import Parts, parts_of
-from magfusion.estimation.posterior.separation import OPEN_POSITION, Separation
+from magfusion.estimation.posterior.separation import OPEN_POSITION, OPEN_ROTATION, Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
@@ -34,11 +33,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
 
     That is with fixes in the graph (loose coupling), for logs so long that their calibration
     drifts, for close tones that are measured jointly, and with factors of a user's.
-
-    Parameters
-    ----------
-    by_magnetometer : bool
-        Whether to exclude each magnetometer rather than each beacon.
+    `by_magnetometer`: whether to exclude each magnetometer rather than each beacon.
     """
     graph = result.graph
     if not _can_separate(graph):
@@ -114,12 +109,8 @@ def _separation(
 ) -> Separation:
     """Return the separation of variants from the first one.
 
-    Parameters
-    ----------
-    others : bool ndarray, shape (variants - 1,)
-        Whether any other beacon is detected.
-    cost, numbers : ndarray, shape (variants - 1,)
-        Squared residuals, and number of rows that are left out.
+    `others` (variants - 1,): whether any other beacon is detected. `cost`, `numbers` (variants -
+    1,): squared residuals, and number of rows that are left out.
     """
     step, cov = (np.array([getattr(v, name) for v in solved]) for name in ("step", "cov"))
     separate = np.array([v.separate_errors for v in solved[1:]])
@@ -166,24 +157,15 @@ class _Tally:
 
 @dataclass(eq=False)
 class _Variant:
-    """A solution with some of the channels.
+    """A solution with some of the channels."""
 
-    Parameters
-    ----------
-    step : ndarray, shape (n, 6)
-    cov, separate_errors : ndarray, shape (n, 6, 6)
-        Of it, and of its difference from the first; both include considered parameters.
-    explained : float
-        Part of the sum of squares.
-    inverse : ndarray, shape (n, 15, 15)
-        As in `ChainSolution`.
-    """
-
-    step: Array
+    step: Array  # (n, 6)
+    # cov, separate_errors: (n, 6, 6), of it, and of its difference from the first; both include
+    # considered parameters
     cov: Array
     separate_errors: Array
-    explained: float
-    inverse: Array
+    explained: float  # part of the sum of squares
+    inverse: Array  # (n, 15, 15), as in `ChainSolution`
 
 
 class _Reference(NamedTuple):
@@ -198,16 +180,12 @@ def _without_each(
 ) -> tuple[list[_Variant], _Reference]:
     """Solve variants with some of the channels, shape (h, channels).
 
-    Parameters
-    ----------
-    before : list of _Variant
-        Solved with other columns of the considered parameters.
-    reference : _Reference, optional
-        By default the first variant.
+    `before`: solved with other columns of the considered parameters. `reference`: by default the
+    first variant.
     """
     count, _, size = parts.parts[0].sums.border.shape
     per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
-    group = max(1, int(chains.AT_ONCE / per_variant))
+    group = max(1, int(AT_ONCE / per_variant))
     known = [one.inverse for one in before] if before else _inverses(parts, kept)
     parts.discard_diagonals()
     out = list(before)
@@ -238,7 +216,7 @@ def _without_each(
 def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:
     """Return `inverses` of all variants together, since each is many small matrices."""
     out: list[Array] = []
-    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
+    group = max(1, int(AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
         out += list(inverses(parts.diagonals(some), parts.following[None]))

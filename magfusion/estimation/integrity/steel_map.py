@@ -16,12 +16,7 @@ from scipy.linalg import block_diag
 from magfusion.estimation.batch.batch import Smoothed, solved_again
 from magfusion.estimation.graph.graph import read_states
 from magfusion.estimation.integrity.fixed_parameter_test import MARGIN
-from magfusion.estimation.integrity.score import (
-    Score,
-    field_residual,
-    moved_estimate,
-    scores_of,
-)
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate, scores_of
 from magfusion.estimation.integrity.smoothed_exclusion import without_beacon
 from magfusion.estimation.integrity.steel_test import (
     STEEL,
@@ -67,24 +62,13 @@ LEAST_SIZE = 0.5  # of the distortion, from which the variances of voxels are so
 
 
 class SteelMap(NamedTuple):
-    """Steel near a path.
-
-    Parameters
-    ----------
-    steel : SteelEstimate
-    mean : ndarray, shape (modes,)
-        Amplitudes (1).
-    cov : ndarray, shape (modes, modes)
-    score : Score
-        Whose last block they are.
-    held_out : dict
-        Error of each beacon's field as predicted by a map of the others, over that without a map.
-    """
+    """Steel near a path."""
 
     steel: SteelEstimate
-    mean: Array
-    cov: Array
-    score: Score
+    mean: Array  # (modes,), amplitudes (1)
+    cov: Array  # (modes, modes)
+    score: Score  # whose last block they are
+    # error of each beacon's field as predicted by a map of the others, over that without a map
     held_out: dict[str, float]
 
     @property
@@ -193,12 +177,7 @@ def step_of(score: Score, mean: Array) -> Array:
 def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | str:
     """Return the map of the steel near a path, or why there is none.
 
-    Parameters
-    ----------
-    result : Smoothed
-        As estimated without a map.
-    imu : ImuSamples
-        As recorded.
+    `result`: as estimated without a map. `imu`: as recorded.
     """
     site = result.calibration.site
     if len(site.beacons) < LEAST_BEACONS:
@@ -232,10 +211,7 @@ def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | str:
 def _sparse(score: Score, sigma: Array, site: Site) -> tuple[Score, Array]:
     """Return a score with the steel in as few voxels as explain it, and sigmas of its amplitudes.
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (modes,)
-        Of the amplitudes, with the same variance in all voxels.
+    `sigma` (modes,): of the amplitudes, with the same variance in all voxels.
     """
     basis, shared = basis_of(score), slice(0, basis_of(score).shared)
     size, own = len(score.gradient), len(sigma) - shared.stop

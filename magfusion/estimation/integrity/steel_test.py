@@ -46,27 +46,13 @@ ROUNDED_UP = (1.0, 2.0, 3.0, 5.0, 10.0)  # steps of the remedy
 
 
 class SteelEstimate(NamedTuple):
-    """Steel that explains a log.
+    """Steel that explains a log."""
 
-    Parameters
-    ----------
-    distortion : float
-        Of the fields, relative, rms over beacons and path.
-    place_world : ndarray, shape (3,)
-        Of the strongest steel (m).
-    place_sigma : float
-        (m)
-    gain : float
-        Decrease of -2 log likelihood, marginalised over amplitudes and size.
-    spread : ndarray, shape (states, 6, 6)
-        Second moment of the effect on the poses, given the residuals.
-    """
-
-    distortion: float
-    place_world: Array
-    place_sigma: float
-    gain: float
-    spread: Array
+    distortion: float  # of the fields, relative, rms over beacons and path
+    place_world: Array  # (3,), of the strongest steel (m)
+    place_sigma: float  # (m)
+    gain: float  # decrease of -2 log likelihood, marginalised over amplitudes and size
+    spread: Array  # (states, 6, 6), second moment of the effect on the poses, given the residuals
 
     def described(self, site: Site) -> str:
         """Return a sentence on the steel."""
@@ -109,12 +95,8 @@ class SteelEstimate(NamedTuple):
 def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | None:
     """Test for steel; None if it does not explain a log better than other causes.
 
-    Parameters
-    ----------
-    rival : float
-        Gain of the causes that are named.
-    doubted : bool
-        Whether it is tested even where no parameter would explain anything.
+    `rival`: gain of the causes that are named. `doubted`: whether it is tested even where no
+    parameter would explain anything.
     """
     rival = max(rival, _best_parameter(case))
     if rival < LEAST_EVIDENCE and not doubted:
@@ -245,12 +227,8 @@ def poses_of_fields(result: Smoothed) -> Trajectory:
 def best_size(information: Array, gradient: Array, shared: BoolArray) -> tuple[float, Array]:
     """Return the gain, averaged over sizes of the distortion, and the most probable sigmas.
 
-    Parameters
-    ----------
-    information, gradient : ndarray, shape (k, k), (k,)
-        Of amplitudes.
-    shared : bool ndarray, shape (k,)
-        Which are shared by all beacons.
+    `information`, `gradient` (k, k), (k,): of amplitudes. `shared` (k,): which are shared by all
+    beacons.
     """
     sizes = [(a, b) for a in SIZES for b in SIZES if a or b]
     sigmas = [np.where(shared, *(max(s, NO_SIZE) for s in pair)) for pair in sizes]

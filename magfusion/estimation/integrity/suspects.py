@@ -232,24 +232,14 @@ TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned 
 
 
 class Suspect(NamedTuple):
-    """Parameters that one mistake would have wrong together.
+    """Parameters that one mistake would have wrong together."""
 
-    Parameters
-    ----------
-    name : str
-        In words.
-    blocks : tuple of Block
-        Among those that are held.
-    combine : ndarray, shape (dimension, columns)
-        Directions that are tried, of all that is held, in units of what is typical.
-    code : str
-        Of its finding; otherwise that of the first block's parameter.
-    """
-
-    name: str
-    blocks: tuple[Block, ...]
+    name: str  # in words
+    blocks: tuple[Block, ...]  # among those that are held
+    # (dimension, columns), directions that are tried, of all that is held, in units of what is
+    # typical
     combine: Array
-    code: str = ""
+    code: str = ""  # of its finding; otherwise that of the first block's parameter
 
     @property
     def finding_code(self) -> str:
@@ -260,10 +250,7 @@ class Suspect(NamedTuple):
 def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
     """Return every parameter that is not estimated, with its typical error for a sigma.
 
-    Parameters
-    ----------
-    steady : bool
-        Whether the steady field is measured.
+    `steady`: whether the steady field is measured.
     """
     known = {block.key for block in estimated}
     every = (*PARAMETERS, *INERTIAL)

@@ -16,49 +16,30 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a sensor measures at an estimate, with derivatives.
+    """What a sensor measures at an estimate, with derivatives."""
 
-    Parameters
-    ----------
-    value : ndarray, shape (n, k)
-    by_pose, by_velocity, by_bias : ndarray, shape (n, k, 6 or 3), optional
-        As of `Rows`.
-    by_parameter : mapping
-        By a parameter of the sensor, in SI units, shape (n, k, columns).
-    by_time : ndarray, shape (n, k), optional
-        By the time of the sample, where it is not that of the state's motion alone.
-    """
-
-    value: Array
+    value: Array  # (n, k)
+    # by_pose, by_velocity, by_bias: (n, k, 6 or 3), as of `Rows`
     by_pose: Array
     by_velocity: Array | None = None
     by_bias: Array | None = None
+    # by a parameter of the sensor, in SI units, shape (n, k, columns)
     by_parameter: Mapping[AidingParameter, Array] = field(default_factory=dict)
+    # (n, k), by the time of the sample, where it is not that of the state's motion alone
     by_time: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class AidingMeasurement(Measurement):
-    """Samples of an aiding sensor.
+    """Samples of an aiding sensor."""
 
-    Parameters
-    ----------
-    sensor : str
-        Name.
-    robust : {None, 'huber', 'cauchy', 'geman-mcclure'}
-    value, sigma : ndarray, shape (n, k)
-        Measured; sigma is infinite for what is not.
-    time_offset : ndarray, shape (n,)
-        By which the sensor's stamps are corrected already (s).
-    inertial_body : ndarray, shape (n, 6)
-        Measured rate and specific force, with their biases (rad/s, m/s^2).
-    """
-
-    sensor: str
-    robust: str | None
+    sensor: str  # name
+    robust: str | None  # 'huber', 'cauchy' or 'geman-mcclure'
+    # value, sigma: (n, k), measured; sigma is infinite for what is not
     value: Array
     sigma: Array
-    time_offset: Array
+    time_offset: Array  # (n,), by which the sensor's stamps are corrected already (s)
+    # (n, 6), measured rate and specific force, with their biases (rad/s, m/s^2)
     inertial_body: Array
 
     @abstractmethod

@@ -41,10 +41,7 @@ def aiding_measurement(
 ) -> AidingMeasurement:
     """Return samples of a sensor as a measurement, one row each.
 
-    Raises
-    ------
-    InputError
-        If a mark is none of the site's.
+    Raises InputError if a mark is none of the site's.
     """
     if sensor.quantity == "relative_pose":
         return relative_pose(sensor, samples, robust)
@@ -72,10 +69,7 @@ def measured_time(sensor: AidingSensor, samples: AidingSamples) -> Array:
 def thinned(sensor: AidingSensor, samples: AidingSamples, last: float) -> AidingSamples:
     """Return the samples that are used: the first of each period of the sensor's rate.
 
-    Parameters
-    ----------
-    last : float
-        Time of the last one before them (s), or minus infinity.
+    `last`: time of the last one before them (s), or minus infinity.
     """
     period = np.floor(samples.time * sensor.rate_hz * (1.0 + 1e-9))
     before = np.floor(last * sensor.rate_hz * (1.0 + 1e-9))
@@ -91,17 +85,8 @@ def aiding_measurements(
 ) -> tuple[tuple[Array, AidingMeasurement], ...]:
     """Return the samples of a log as measurements, with the times of their rows (s).
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        Its stamps on the log's clock.
-    span : tuple of float
-        First and last time of the states (s); samples outside are left out.
-
-    Raises
-    ------
-    InputError
-        If no interval of a relative pose can be used.
+    `imu`: its stamps on the log's clock. `span`: first and last time of the states (s); samples
+    outside are left out. Raises InputError if no interval of a relative pose can be used.
     """
     out = []
     for name, every in aiding.items():

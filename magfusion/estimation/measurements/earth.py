@@ -51,32 +51,15 @@ class EarthField(Measurement):
 
     Windows are symmetric, and a ramp is fitted with the constant: the time offset has an effect
     only by the rotation of the states.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : ndarray, shape (n, 3)
-        (T)
-    sqrt_information : ndarray, shape (n, 3, 3)
-        Whitening; zero where missing.
-    rate_body : ndarray, shape (n, 3)
-        Angular rate, for the time offset (rad/s).
-    repeats : float
-        Number of consecutive epochs that count as one measurement.
-    applied_offset : ndarray, shape (n,)
-        IMU time offset used to cut the inertial data (s).
-    robust : bool
-        Whether a field that contradicts the motion is rejected.
     """
 
-    time: Array
-    measured: Array
-    sqrt_information: Array
-    rate_body: Array
-    repeats: float
-    applied_offset: Array
-    robust: bool = True
+    time: Array  # (n,) (s)
+    measured: Array  # (n, 3) (T)
+    sqrt_information: Array  # (n, 3, 3), whitening; zero where missing
+    rate_body: Array  # (n, 3), angular rate, for the time offset (rad/s)
+    repeats: float  # number of consecutive epochs that count as one measurement
+    applied_offset: Array  # (n,), IMU time offset used to cut the inertial data (s)
+    robust: bool = True  # whether a field that contradicts the motion is rejected
 
     @property
     def loss(self) -> Loss | None:
@@ -139,12 +122,7 @@ def earth_measurement(
 
 
 def check_earth(site: Site) -> None:
-    """Reject a site that cannot use the Earth field.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject a site that cannot use the Earth field."""
     field, gravity = site.earth_field_world, site.gravity
     if site.platform.further:
         raise InputError(
@@ -189,12 +167,7 @@ def _moving_mean(time: Array, value: Array) -> Array:
 def disturbed(residual: Array, repeats: float) -> BoolArray:
     """Return at which epochs the motion contradicts the Earth field.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n, 3)
-        Whitened.
-    repeats : float
-        Number of epochs that count as one measurement.
+    `residual` (n, 3): whitened. `repeats`: number of epochs that count as one measurement.
     """
     weight, _ = robust_weight(repeats * np.sum(residual**2, axis=1), EARTH_LOSS, components=3)
     return weight < DISTURBED
@@ -236,10 +209,7 @@ def speed_sigma(step: float, motion: MotionModel) -> float:
 class EarthWeight:
     """Weight of the Earth field at a prediction, epoch by epoch.
 
-    Parameters
-    ----------
-    blocks : tuple of Block
-        Calibration parameters in the state's tangent.
+    `blocks`: calibration parameters in the state's tangent.
     """
 
     refused_at: float
@@ -251,11 +221,8 @@ class EarthWeight:
     def weighed(self, measurement: EarthField, state: State) -> tuple[EarthField, bool]:
         """Return the weighted measurement of an epoch, and whether the field is disturbed.
 
-        Parameters
-        ----------
-        state : State
-            Prediction.  The weight decreases to zero with the distance from it, and remains zero
-            for a while, as an accepted disturbance would pull the state.
+        `state`: prediction. The weight decreases to zero with the distance from it, and remains
+        zero for a while, as an accepted disturbance would pull the state.
         """
         whole = replace(
             measurement,

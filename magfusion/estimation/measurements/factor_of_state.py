@@ -16,18 +16,10 @@ WIDTHS = {X(0): 6, V(0): 3, B(0): 6}
 
 @dataclass(frozen=True, eq=False)
 class StateFactor(Measurement):
-    """Factors, linearised at the state of their epoch and weighted by their own noise models.
+    """Factors, linearised at the state of their epoch and weighted by their own noise models."""
 
-    Parameters
-    ----------
-    factors : UserFactors
-        On X(0), V(0), B(0), or some of them, and on keys of their own.
-    identity : int
-        Distinguishes factors that print the same text.
-    """
-
-    factors: UserFactors
-    identity: int
+    factors: UserFactors  # on X(0), V(0), B(0), or some of them, and on keys of their own
+    identity: int  # distinguishes factors that print the same text
 
     def linearize(
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]

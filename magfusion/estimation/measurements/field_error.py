@@ -55,12 +55,7 @@ class FieldError(BeaconParameter):
     group = kind = "field_error"
 
     def __init__(
-        self,
-        time: Array,
-        modes: Array,
-        relative: Array,
-        sensor_from_world: Array,
-        combine: Array,
+        self, time: Array, modes: Array, relative: Array, sensor_from_world: Array, combine: Array
     ) -> None:
         self._time, self._modes, self._combine = time, modes, combine
         self._relative, self._sensor_from_world = relative, sensor_from_world
@@ -84,12 +79,7 @@ class FieldError(BeaconParameter):
 def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]:
     """Return the errors of the beacons' fields at some epochs, to be considered.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Of the fields (s).
-    poses : Trajectory
-        Poses at these times.
+    `time` (n,): of the fields (s). `poses`: poses at these times.
     """
     length, channels = site.model_error_length, len(site.channels)
     if length <= 0.0 or not len(time):
@@ -125,14 +115,8 @@ def largest_combinations(modes: Array, field_world: ComplexArray, maximum: int) 
     """Return the combinations of modes and components of a field that bend it most, (m, 3, k).
 
     All whose variance is larger than that of an independent error at each epoch, at least one.
-
-    Parameters
-    ----------
-    modes : ndarray, shape (n, magnetometers, m)
-    field_world : complex ndarray, shape (n, magnetometers, tones, 3)
-        (T)
-    maximum : int
-        Maximum number k.
+    `modes` (n, magnetometers, m), `field_world` (n, magnetometers, tones, 3) (T). `maximum`:
+    maximum number k.
     """
     power = 0.5 * np.sum(np.abs(field_world) ** 2, axis=-1, keepdims=True)
     unit = field_world / np.sqrt(np.maximum(power, np.finfo(float).tiny))
@@ -147,14 +131,7 @@ def largest_combinations(modes: Array, field_world: ComplexArray, maximum: int) 
 def modes_in_place(position_world: Array, length: float, maximum: int) -> Array:
     """Return the modes of an error of correlation exp(-d / length) at positions, shape (n, m).
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    length : float
-        (m)
-    maximum : int
-        Maximum number of modes.
+    `position_world` (n, 3) (m), `length` (m). `maximum`: maximum number of modes.
     """
     size, (owner, members, centre) = 1.0, cells(position_world, length)
     while len(centre) > MOST_CELLS:

@@ -19,16 +19,10 @@ SIGMA = 1e-3  # rad; reported covariances include any roll
 
 @dataclass(frozen=True, eq=False)
 class HeldRoll(Measurement):
-    """Zero rotation about an axis of the body from given attitudes.
+    """Zero rotation about an axis of the body from given attitudes."""
 
-    Parameters
-    ----------
-    axis_body : ndarray, shape (n, 3)
-    world_from_body : ndarray, shape (n, 3, 3)
-    """
-
-    axis_body: Array
-    world_from_body: Array
+    axis_body: Array  # (n, 3)
+    world_from_body: Array  # (n, 3, 3)
 
     def linearize(
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
@@ -53,12 +47,8 @@ def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Traj
     """Return states whose attitudes do not rotate about the coil from one to the next.
 
     The coil's position and direction are unchanged; the first state has the smallest rotation.
-
-    Parameters
-    ----------
-    signed : bool
-        Whether the sense of the coil is known.  Amplitudes do not determine it: the first points
-        up, and none reverses from one state to the next.
+    `signed`: whether the sense of the coil is known. Amplitudes do not determine it: the first
+    points up, and none reverses from one state to the next.
     """
     sensor = site.platform.magnetometer
     axis, lever = axis_of(sensor), coil_lever(sensor)

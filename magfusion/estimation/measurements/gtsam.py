@@ -15,12 +15,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.noise import paired_whitening, stacked, whitening
-from magfusion.model.parameters import (
-    PARAMETERS,
-    BeaconParameter,
-    Calibration,
-    choose_blocks,
-)
+from magfusion.model.parameters import PARAMETERS, BeaconParameter, Calibration, choose_blocks
 from magfusion.units import Array, ComplexArray
 
 ABSENT = gtsam.symbol("!", 0)  # a velocity or bias that is in no values

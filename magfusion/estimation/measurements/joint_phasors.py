@@ -16,45 +16,25 @@ NOTHING_LEFT = 1e-6  # of a channel's information, after exclusion of others
 
 @dataclass(frozen=True, eq=False)
 class JointPhasors(Measurement):
-    """Directions of the samples of short windows, each of all phasors; one group an epoch.
+    """Directions of the samples of short windows, each of all phasors; one group an epoch."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Centres of the windows (s).
-    measured : ndarray, shape (n, 3 directions)
-        Residual of the prediction plus its value at the nodes (T); axes of the centre.
-    basis : ndarray, shape (n, directions, nodes, 2 channels)
-        By real and imaginary part of each channel's phasor; zero for channels not predicted.
-    whitening : ndarray, shape (n, 3 directions, 3 directions)
-    elapsed : ndarray, shape (n, nodes)
-        Of the nodes, from the centre (s).
-    shift_body : ndarray, shape (n, nodes, 3)
-        Displacement of the sensor beyond a steady velocity, axes of the centre (m).
-    strength : ndarray, shape (n, nodes, channels)
-        Of each channel's field, relative to that at the centre.
-    rate_body : ndarray, shape (n, 3)
-        As of `FieldPhasors`, as are the next two (rad/s).
-    applied_offset : ndarray, shape (n,)
-    moving : bool ndarray, shape (n,)
-    is_predicted : bool ndarray, shape (n, channels)
-        Channels that are predicted.
-    robust : {None, 'huber', 'cauchy'}
-        Loss of each window.
-    """
-
-    time: Array
+    time: Array  # (n,), centres of the windows (s)
+    # (n, 3 directions), residual of the prediction plus its value at the nodes (T); axes of the
+    # centre
     measured: Array
+    # (n, directions, nodes, 2 channels), by real and imaginary part of each channel's phasor; zero
+    # for channels not predicted
     basis: Array
-    whitening: Array
-    elapsed: Array
+    whitening: Array  # (n, 3 directions, 3 directions)
+    elapsed: Array  # (n, nodes), of the nodes, from the centre (s)
+    # (n, nodes, 3), displacement of the sensor beyond a steady velocity, axes of the centre (m)
     shift_body: Array
-    strength: Array
-    rate_body: Array
-    applied_offset: Array
-    moving: BoolArray
-    is_predicted: BoolArray
-    robust: str | None = None
+    strength: Array  # (n, nodes, channels), of each channel's field, relative to that at the centre
+    rate_body: Array  # (n, 3), as of `FieldPhasors`, as are the next two (rad/s)
+    applied_offset: Array  # (n,)
+    moving: BoolArray  # (n,)
+    is_predicted: BoolArray  # (n, channels), channels that are predicted
+    robust: str | None = None  # loss of each window: 'huber' or 'cauchy'
 
     @property
     def loss(self) -> Loss | None:
@@ -178,14 +158,7 @@ class JointPhasors(Measurement):
     def spanned(self, channels: BoolArray) -> Array:
         """Return an orthonormal basis of the whitened rows spanned by phasors of channels.
 
-        Parameters
-        ----------
-        channels : bool ndarray, shape (n, channels)
-
-        Returns
-        -------
-        ndarray, shape (n, rows, k)
-            Padded with zero columns.
+        `channels` (n, channels). Returns (n, rows, k): padded with zero columns.
         """
         by = np.where(channels[..., None, None], self.of_channels(), 0.0)
         by = np.moveaxis(by, 1, 2).reshape(len(by), by.shape[2], -1)
@@ -217,14 +190,8 @@ def at_nearest(time: Array, seen: BoolArray, wanted: Array) -> BoolArray:
 def in_directions(basis: Array, by: Array) -> Array:
     """Transform columns of phasors to those of directions.
 
-    Parameters
-    ----------
-    basis : ndarray, shape (n, directions, nodes, 2 channels)
-    by : ndarray, shape (n nodes, channels, 6, k)
-
-    Returns
-    -------
-    ndarray, shape (n, 3 directions, k)
+    `basis` (n, directions, nodes, 2 channels), `by` (n nodes, channels, 6, k). Returns
+    (n, 3 directions, k).
     """
     n, directions, nodes, parts = basis.shape
     width = by.shape[-1]

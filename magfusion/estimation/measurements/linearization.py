@@ -28,21 +28,10 @@ def relinearized(
 ) -> FieldPhasors | None:
     """Return an epoch's fields linearised at their own most probable pose, by Gauss-Newton steps.
 
-    The update of an iterated extended Kalman filter (Bell and Cathey 1993,
-    doi 10.1109/9.250476): innovation and Jacobian are those of the last point, the prior is that
-    of the prediction.
-
-    Parameters
-    ----------
-    predicted : State
-        With its covariance.
-    blocks : tuple of Block
-        Calibration parameters in its tangent.
-
-    Returns
-    -------
-    FieldPhasors or None
-        None if the steps do not converge.
+    The update of an iterated extended Kalman filter (Bell and Cathey 1993, doi 10.1109/9.250476):
+    innovation and Jacobian are those of the last point, the prior is that of the prediction.
+    `predicted`: with its covariance. `blocks`: calibration parameters in its tangent. Returns None
+    if the steps do not converge.
     """
     pose, distance = predicted.pose, _nearest(predicted)
     for _ in range(MAX_ITERATIONS):

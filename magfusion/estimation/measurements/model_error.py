@@ -26,12 +26,7 @@ CHUNK = 1_000_000  # pairs at a time
 def epochs_sharing_error(position_world: Array, length: float) -> Array:
     """Return how many epochs of a log share the model error of each, shape (n,).
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    length : float
-        Correlation length (m).
+    `position_world` (n, 3) (m). `length`: correlation length (m).
     """
     count = len(position_world)
     if length <= 0.0:
@@ -47,18 +42,8 @@ def epochs_sharing_error(position_world: Array, length: float) -> Array:
 def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Array]:
     """Return the spatial cell of each position, the number in each, and their centres.
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    length : float
-        Correlation length (m).
-
-    Returns
-    -------
-    owner : int ndarray, shape (n,)
-    members : int ndarray, shape (cells,)
-    centre : ndarray, shape (cells, 3)
+    `position_world` (n, 3) (m). `length`: correlation length (m). Returns `owner` (n,);
+    `members` (cells,); `centre` (cells, 3).
     """
     cell = np.floor(position_world * (CELLS / length)).astype(np.int64)
     _, owner, members = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
@@ -70,14 +55,7 @@ def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Arr
 def epochs_sharing_error_online(speed: float, step: float, length: float) -> float:
     """Return the approximate number of epochs that share a model error, at a steady speed.
 
-    Parameters
-    ----------
-    speed : float
-        (m/s)
-    step : float
-        Time between epochs (s).
-    length : float
-        Correlation length (m).
+    `speed` (m/s). `step`: time between epochs (s). `length`: correlation length (m).
     """
     if length <= 0.0:
         return 1.0
@@ -88,12 +66,7 @@ def epochs_sharing_error_online(speed: float, step: float, length: float) -> flo
 def epochs_sharing_error_at(state: State, step: float) -> float:
     """Return the number of epochs in the estimator's memory that share a model error.
 
-    Parameters
-    ----------
-    state : State
-        Predicted at the epoch.
-    step : float
-        Time between epochs (s).
+    `state`: predicted at the epoch. `step`: time between epochs (s).
     """
     site, speed = state.calibration.site, float(np.linalg.norm(state.velocity_world))
     shared = epochs_sharing_error_online(speed, step, site.model_error_length)
@@ -105,14 +78,8 @@ def epochs_sharing_error_at(state: State, step: float) -> float:
 def held_by_prior(site: Site, position_world: Array, step: float) -> float:
     """Return the number of epochs in the memory of a motion prior, at least one.
 
-    Parameters
-    ----------
-    site : Site
-        From `magfusion.model.without_imu.on_motion_prior`.
-    position_world : ndarray, shape (3,)
-        (m)
-    step : float
-        Time between epochs (s).
+    `site`: from `magfusion.model.without_imu.on_motion_prior`. `position_world` (3,) (m). `step`:
+    time between epochs (s).
     """
     separate = np.array([beacon.position_world for beacon in site.beacons]) - position_world
     relative = float(np.max(model_error(site)))

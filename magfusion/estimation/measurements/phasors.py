@@ -12,12 +12,7 @@ from magfusion.estimation.graph.state import State, States, pose_steps, states_o
 from magfusion.estimation.measurements.signs import whitened_along
 from magfusion.model.detection_range import are_many
 from magfusion.model.field import skew
-from magfusion.model.noise import (
-    paired_whitening,
-    sensor_positions,
-    stacked,
-    weighed_and_alone,
-)
+from magfusion.model.noise import paired_whitening, sensor_positions, stacked, weighed_and_alone
 from magfusion.model.parameters import (
     CLOCK_RATE,
     TIME_OFFSET,
@@ -39,53 +34,30 @@ MANY_COLUMNS = 64  # of parameters, most of which belong to one beacon
 
 @dataclass(frozen=True, eq=False)
 class FieldPhasors(Measurement):
-    """Phasors of all channels, one group each.
+    """Phasors of all channels, one group each."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : ndarray, shape (n, channels, 6)
-        Real, then imaginary part (T); zero where missing.
-    sqrt_information : ndarray, shape (n, channels, 6, 6)
-        Whitening; zero where missing.
-    rate_body : ndarray, shape (n, 3)
-        Angular rate, for the time offset (rad/s).
-    by_time_offset : ndarray, shape (n, channels, 6)
-        Effect of its change on the lock-in at fixed states (T/s).
-    applied_offset : ndarray, shape (n,)
-        IMU time offset used to cut the inertial data (s).
-    moving : bool ndarray, shape (n,)
-        Where the clocks have an effect: not for a stationary platform, where noise of rate and
-        velocity would be taken for information on them.
-    ahead : ndarray, shape (n, channels), optional
-        Time of the measurement after that of the row (s), as of `FieldSamples`.
-    robust : {None, 'huber', 'cauchy'}
-        Loss of each channel.
-    excess : ndarray, shape (n, channels), optional
-        Ratio of the variance used to that of an independent epoch, as epochs close by share a
-        model error.
-    detected : bool ndarray, shape (n, channels), optional
-        Channels that are predicted; None for all.
-    world_from_body, position_world : ndarray, shape (n, 3, 3) and (n, 3), optional
-        Pose at which the fields are linearised instead of the states': for an iterated update.
-    predicted : Predictions
-        Shared by all measurements that differ in their weights alone.
-    """
-
-    time: Array
-    measured: Array
-    sqrt_information: Array
-    rate_body: Array
+    time: Array  # (n,) (s)
+    measured: Array  # (n, channels, 6), real, then imaginary part (T); zero where missing
+    sqrt_information: Array  # (n, channels, 6, 6), whitening; zero where missing
+    rate_body: Array  # (n, 3), angular rate, for the time offset (rad/s)
+    # (n, channels, 6), effect of its change on the lock-in at fixed states (T/s)
     by_time_offset: Array
-    applied_offset: Array
+    applied_offset: Array  # (n,), IMU time offset used to cut the inertial data (s)
+    # (n,), where the clocks have an effect: not for a stationary platform, where noise of rate and
+    # velocity would be taken for information on them
     moving: BoolArray
+    # (n, channels), time of the measurement after that of the row (s), as of `FieldSamples`
     ahead: Array | None = None
-    robust: str | None = None
+    robust: str | None = None  # loss of each channel: 'huber' or 'cauchy'
+    # (n, channels), ratio of the variance used to that of an independent epoch, as epochs close by
+    # share a model error
     excess: Array | None = None
-    detected: BoolArray | None = None
+    detected: BoolArray | None = None  # (n, channels), channels that are predicted; None for all
+    # world_from_body, position_world: (n, 3, 3) and (n, 3), pose at which the fields are linearised
+    # instead of the states': for an iterated update
     world_from_body: Array | None = None
     position_world: Array | None = None
+    # shared by all measurements that differ in their weights alone
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
 
     @property

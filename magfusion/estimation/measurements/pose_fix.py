@@ -14,22 +14,12 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class PoseFix(Measurement):
-    """A pose from another estimator, one group of six.
+    """A pose from another estimator, one group of six."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    sqrt_information : ndarray, shape (n, 6, 6)
-        Whitening: rotation, then position, body axes.
-    robust : {None, 'huber', 'cauchy'}
-    """
-
-    world_from_body: Array
-    position_world: Array
-    sqrt_information: Array
-    robust: str | None = None
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    sqrt_information: Array  # (n, 6, 6), whitening: rotation, then position, body axes
+    robust: str | None = None  # 'huber' or 'cauchy'
 
     @property
     def loss(self) -> Loss | None:
@@ -37,10 +27,7 @@ class PoseFix(Measurement):
         return None if self.robust is None else Loss(self.robust)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate."""
         error, by_pose = np.empty((len(states), 6)), np.empty((len(states), 6, 6))
@@ -48,15 +35,12 @@ class PoseFix(Measurement):
             fix = gtsam.Pose3(gtsam.Rot3(self.world_from_body[i]), self.position_world[i])
             pose = gtsam.Pose3(gtsam.Rot3(states.world_from_body[i]), states.position_world[i])
             separate = fix.between(pose)
-            error[i], by_pose[i] = gtsam.Pose3.Logmap(separate), _log_jacobian(separate)
+            error[i] = gtsam.Pose3.Logmap(separate)
+            by_pose[i] = gtsam.Pose3.LogmapDerivative(separate)
         return Rows(
             error=(self.sqrt_information @ error[..., None])[:, None, :, 0],
             by_pose=(self.sqrt_information @ by_pose)[:, None],
         )
-
-
-def _log_jacobian(pose: gtsam.Pose3) -> Array:
-    return gtsam.Pose3.LogmapDerivative(pose)
 
 
 def pose_fixes(fixes: Trajectory, robust: str | None = None) -> PoseFix:

@@ -41,37 +41,21 @@ class RelativePose(AidingMeasurement):
 
     The rows of the rotation are the rotation vector from the measured to the predicted one; their
     measured value is zero.
-
-    Parameters
-    ----------
-    interval : ndarray, shape (n,)
-        Length (s).
-    rotation_measured : ndarray, shape (n, 3, 3)
-    noise : ndarray, shape (n, 6)
-        Of the sensor; ``sigma`` includes that of the inertial samples (m, rad).
-    gravity : float
-        (m/s^2)
-    rate_begin : ndarray, shape (n, 3)
-        Measured at the beginning, with its bias (rad/s).
-    bias : ndarray, shape (n, 6)
-        Accelerometer, then gyro bias at which the samples are preintegrated (m/s^2, rad/s).
-    rotated, gained, passed : ndarray, shape (n, 3, 3) and (n, 3)
-        Preintegrated rotation, velocity (m/s) and position (m) in axes of the body at the
-        beginning.
-    by_bias : ndarray, shape (n, 9, 6)
-        Their derivatives: rotation on the right, position and velocity.
     """
 
-    interval: Array
-    rotation_measured: Array
-    noise: Array
-    gravity: float
-    rate_begin: Array
+    interval: Array  # (n,), length (s)
+    rotation_measured: Array  # (n, 3, 3)
+    noise: Array  # (n, 6), of the sensor; ``sigma`` includes that of the inertial samples (m, rad)
+    gravity: float  # (m/s^2)
+    rate_begin: Array  # (n, 3), measured at the beginning, with its bias (rad/s)
+    # (n, 6), accelerometer, then gyro bias at which the samples are preintegrated (m/s^2, rad/s)
     bias: Array
+    # rotated, gained, passed: (n, 3, 3) and (n, 3), preintegrated rotation, velocity (m/s) and
+    # position (m) in axes of the body at the beginning
     rotated: Array
     gained: Array
     passed: Array
-    by_bias: Array
+    by_bias: Array  # (n, 9, 6), their derivatives: rotation on the right, position and velocity
 
     def over_interval(
         self,

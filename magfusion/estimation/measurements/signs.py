@@ -26,10 +26,7 @@ OPEN_SIGN = "amplitude near zero, whose sign is open"
 def along_axis(fields: FieldSamples, site: Site) -> FieldSamples:
     """Return amplitudes along the one axis of a site's receiver; phasors unchanged.
 
-    Raises
-    ------
-    InputError
-        Where the receiver has more axes.
+    Raises InputError where the receiver has more axes.
     """
     own = site.platform.magnetometer.axes
     if fields.signed or fields.axes == own:

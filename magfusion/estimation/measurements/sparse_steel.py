@@ -21,12 +21,9 @@ NEGLIGIBLE = 1e-9  # of the largest variance, and of the strongest mode
 def voxel_variances(basis: SteelBasis, information: Array, gradient: Array, sigma: float) -> Array:
     """Return the most probable variance of each voxel, of unit amplitudes of the modes, (v,).
 
-    Parameters
-    ----------
-    information, gradient : ndarray, shape (shared, shared), (shared,)
-        Of the amplitudes of the shared modes, all others eliminated.
-    sigma : float
-        Of these amplitudes, from which it is sought: all voxels have the same variance.
+    `information`, `gradient` (shared, shared), (shared,): of the amplitudes of the shared modes,
+    all others eliminated. `sigma`: of these amplitudes, from which it is sought: all voxels have
+    the same variance.
     """
     by_mode = basis.tensor / basis.unit
     value, vector = eigh(information)
@@ -49,17 +46,9 @@ def voxel_variances(basis: SteelBasis, information: Array, gradient: Array, sigm
 def with_variances(basis: SteelBasis, site: Site, variance: Array) -> tuple[SteelBasis, Array]:
     """Return a basis whose shared modes have other variances of the voxels.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (v,)
-        As of `voxel_variances`.
-
-    Returns
-    -------
-    SteelBasis
-        Of amplitudes of unit variance; without modes that the basis did not know.
-    old_by_new : ndarray, shape (shared, fewer)
-        Amplitudes of the shared modes by a unit of each.
+    `variance` (v,): as of `voxel_variances`. Returns the basis of amplitudes of unit variance,
+    without modes that the basis did not know; `old_by_new` (shared, fewer): amplitudes of the
+    shared modes by a unit of each.
     """
     by_mode = basis.tensor / basis.unit
     of_all = variance[:, None, None] * by_mode

@@ -51,41 +51,23 @@ for _k, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
 
 
 class Voxels(NamedTuple):
-    """Places of possible steel.
+    """Places of possible steel."""
 
-    Parameters
-    ----------
-    centre_world : ndarray, shape (v, 3)
-        (m)
-    edge : ndarray, shape (v,)
-        (m)
-    """
-
-    centre_world: Array
-    edge: Array
+    centre_world: Array  # (v, 3) (m)
+    edge: Array  # (v,) (m)
 
 
 class SteelBasis(NamedTuple):
-    """Modes of steel at any place: first those shared by all beacons, then those of each tone.
-
-    Parameters
-    ----------
-    voxels : Voxels
-    moment : ndarray, shape (v, tones, 3, modes)
-        Moment of each voxel by a unit of each, times mu0 (T m^3).
-    polarisability : ndarray, shape (v, tones, 3, modes)
-        The same over the field of the tone there.
-    tensor : ndarray, shape (v, 6, shared)
-        Polarisability of each voxel by a unit of each shared mode, over the root of its volume, by
-        component of `TENSORS`.
-    softening : float
-        Distance below which the field of a voxel is no more that of a dipole, over its edge.
-    """
+    """Modes of steel at any place: first those shared by all beacons, then those of each tone."""
 
     voxels: Voxels
+    # (v, tones, 3, modes), moment of each voxel by a unit of each, times mu0 (T m^3)
     moment: AnyArray
-    polarisability: AnyArray
+    polarisability: AnyArray  # (v, tones, 3, modes), the same over the field of the tone there
+    # (v, 6, shared), polarisability of each voxel by a unit of each shared mode, over the root of
+    # its volume, by component of `TENSORS`
     tensor: Array
+    # distance below which the field of a voxel is no more that of a dipole, over its edge
     softening: float
 
     @property
@@ -123,16 +105,9 @@ class SteelBasis(NamedTuple):
 class SteelModes(Parameter):
     """Amplitudes of the modes of a basis.
 
-    Parameters
-    ----------
-    basis : SteelBasis
-    time : ndarray, shape (n,)
-        Of epochs (s).
-    fields : mapping of str to ndarray, shape (n, tones, 3, modes)
-        Added to each beacon's field by a unit of each, world axes (T); of none, without a column.
-    sources : mapping of str to ndarray, shape (n, tones, 3)
-        The beacons' fields of the same drive phase, world axes (T).
-    sensor_from_world : ndarray, shape (n, 3, 3)
+    `time` (n,): of epochs (s). `fields` (n, tones, 3, modes) each: added to each beacon's field by
+    a unit of each, world axes (T); of none, without a column. `sources` (n, tones, 3) each: the
+    beacons' fields of the same drive phase, world axes (T). `sensor_from_world` (n, 3, 3).
     """
 
     group = kind = "steel"
@@ -288,10 +263,7 @@ def _basis(
 def unit_moments(voxels: Voxels, at_voxels: AnyArray) -> AnyArray:
     """Return the moments by a unit of each component of the tensors, (v, tones, 3, 6) (T m^3).
 
-    Parameters
-    ----------
-    at_voxels : ndarray, shape (v, tones, 3)
-        The beacons' fields there (T).
+    `at_voxels` (v, tones, 3): the beacons' fields there (T).
     """
     root = voxels.edge[:, None, None, None] ** 1.5
     return np.asarray(np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root)
@@ -355,14 +327,9 @@ def _dipole_tensors(point_world: Array, centre_world: Array, softening: Array) -
 def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> Array:
     """Return the amplitudes of each voxel in the strongest modes of distortion, (v, k, modes).
 
-    Parameters
-    ----------
-    tensors : ndarray, shape (n, v, 3, 3)
-        Field of a unit moment of each voxel at places.
-    at_place : ndarray, shape (n, tones, 3)
-        The beacons' fields there.
-    moment : ndarray, shape (v, tones, 3, k)
-        Of each voxel, by a sigma of each of its k independent amplitudes.
+    `tensors` (n, v, 3, 3): field of a unit moment of each voxel at places.
+    `at_place` (n, tones, 3): the beacons' fields there. `moment` (v, tones, 3, k): of each voxel,
+    by a sigma of each of its k independent amplitudes.
     """
     size = np.linalg.norm(at_place, axis=2)[..., None]
     relative = np.stack(

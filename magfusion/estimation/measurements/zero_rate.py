@@ -20,24 +20,13 @@ LONGEST_MEAN = 2.0  # s
 
 @dataclass(frozen=True, eq=False)
 class ZeroRate(Measurement):
-    """The gyroscope's bias equals its reading.
+    """The gyroscope's bias equals its reading."""
 
-    Parameters
-    ----------
-    measured_body : ndarray, shape (n, 3)
-        (rad/s)
-    sigma : ndarray, shape (n,)
-        (rad/s)
-    """
-
-    measured_body: Array
-    sigma: Array
+    measured_body: Array  # (n, 3) (rad/s)
+    sigma: Array  # (n,) (rad/s)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, one group of three."""
         weight = 1.0 / self.sigma[:, None, None]
@@ -57,16 +46,9 @@ def zero_rate(
 ) -> ZeroRate | None:
     """Return the gyroscope's mean around stationary epochs as a measurement; None in a gap.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Of the epochs, increasing (s).
-    within : tuple of ndarray, shape (n,)
-        Begin and end of the stationary interval of each (s).
-    time_offset : ndarray, shape (n,)
-        Of the IMU's stamps at each (s).
-    noise : float
-        Density of the gyroscope's noise (rad/s/sqrt(Hz)).
+    `time` (n,): of the epochs, increasing (s). `within` (n,) each: begin and end of the stationary
+    interval of each (s). `time_offset` (n,): of the IMU's stamps at each (s). `noise`: density of
+    the gyroscope's noise (rad/s/sqrt(Hz)).
     """
     if len(time) == 0 or len(imu) == 0:
         return None
@@ -87,10 +69,7 @@ def zero_rate(
 def without_bias(imu: ImuSamples, begin: Array, end: Array) -> ImuSamples:
     """Remove the mean rate of stationary intervals from inertial samples, interpolated between.
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (rests,)
-        By the IMU's stamps (s).
+    `begin`, `end` (rests,): by the IMU's stamps (s).
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro_body, axis=0)])
     first, last = np.searchsorted(imu.time, begin), np.searchsorted(imu.time, end)

@@ -21,27 +21,17 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class ZeroVelocity(Measurement):
-    """The velocity is zero: the platform is at rest.
+    """The velocity is zero: the platform is at rest."""
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (n,)
-        (m/s)
-    """
-
-    sigma: Array
+    sigma: Array  # (n,) (m/s)
 
     def linearize(
-        self,
-        states: States,
-        calibration: Calibration,
-        blocks: tuple[Block, ...],
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, one group of three."""
         weight = 1.0 / self.sigma[:, None, None]
         return Rows(
-            error=weight * states.velocity_world[:, None],
-            by_velocity=weight[..., None] * _EYE,
+            error=weight * states.velocity_world[:, None], by_velocity=weight[..., None] * _EYE
         )
 
 
@@ -53,10 +43,7 @@ def zero_velocity(epoch: IntArray, sigma: float) -> ZeroVelocity:
 def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArray:
     """Return at which times the IMU has been quiet for the rest span, without a gap.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (n,)
-        On the IMU's clock (s).
+    `stamps` (n,): on the IMU's clock (s).
     """
     time, count, span = imu.time, len(imu), motion.rest_span
     if count < MIN_SAMPLES:
@@ -89,14 +76,8 @@ def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArr
     """Return where the velocity estimate is consistent with rest.
 
     A slow steady motion is as quiet as a rest, so that the velocity decides.  An unknown velocity
-    is consistent with anything and gives no information.
-
-    Parameters
-    ----------
-    velocity_world : ndarray, shape (..., 3)
-        (m/s)
-    cov : ndarray, shape (..., 3, 3)
-        Of the velocity (m^2/s^2).
+    is consistent with anything and gives no information. `velocity_world` (..., 3) (m/s).
+    `cov` (..., 3, 3): of the velocity (m^2/s^2).
     """
     known = np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1) < motion.rest_known_speed**2
     slow = (velocity_world**2).sum(axis=-1) < REST_GATE * motion.rest_speed_sigma**2

@@ -22,15 +22,9 @@ MOST_MISTAKES = 2  # undone together; with more, the site is another one
 class AppliedCorrections:
     """What is undone, how uncertain that leaves the states, and when the next may be tried.
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        One a mistake, with its remedy.
-    content : str, optional
-        Of the corrected site's file, as JSON.
-    rival : Correction, optional
-        Of the last one: tried first where the corrected states are contradicted.  A checkpoint has
-        none.
+    `findings`: one a mistake, with its remedy. `content`: of the corrected site's file, as JSON.
+    `rival`: of the last correction, tried first where the corrected states are contradicted; a
+    checkpoint has none.
     """
 
     findings: tuple[Finding, ...]

@@ -21,11 +21,7 @@ class ConstantMotionModel:
     """Covariance of prediction errors, body axes.
 
     The average of the last `MEMORY` seconds, or of the most recent ones where that is larger.
-
-    Parameters
-    ----------
-    horizon : float
-        Of the measured predictions (s); others scale with powers of time, bounded below.
+    `horizon`: of the measured predictions (s); others scale with powers of time, bounded below.
     """
 
     _mean: Array

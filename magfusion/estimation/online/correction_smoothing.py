@@ -11,18 +11,11 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """A correction that has not fully entered the output.
+    """A correction that has not fully entered the output."""
 
-    Parameters
-    ----------
-    time : float
-        Of the correction (s).
-    step : ndarray, shape (9,)
-        From the corrected state to the previous output, world axes: rotation (on the left),
-        position, velocity.
-    """
-
-    time: float
+    time: float  # of the correction (s)
+    # (9,), from the corrected state to the previous output, world axes: rotation (on the left),
+    # position, velocity
     step: Array
 
 

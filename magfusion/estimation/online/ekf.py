@@ -42,14 +42,8 @@ class ErrorStateFilter(PartialUpdateFilter):
       of the last update, ``x_post`` is the correction of the predicted state.
     - A robust loss has already weighted the rows.
 
-    Parameters
-    ----------
-    state : State
-        Initial state.
-    blocks : tuple of Block
-        Calibration parameters in its tangent.
-    considered : int
-        Parameters at the tangent's end that are considered, not estimated.
+    `state`: initial state. `blocks`: calibration parameters in its tangent. `considered`:
+    parameters at the tangent's end that are considered, not estimated.
     """
 
     state: State
@@ -69,19 +63,9 @@ class ErrorStateFilter(PartialUpdateFilter):
     ) -> None:
         """Update with the measurements at the end of an interval.
 
-        Parameters
-        ----------
-        predicted : Propagated
-            From ``state``.
-        measurements : sequence of Measurement
-            Of this epoch.
-        linearization_point : State, optional
-            Where to linearise if the prediction is too uncertain; then three iterations.
-
-        Raises
-        ------
-        EstimationError
-            If the arithmetic fails; the state is then unchanged.
+        `predicted`: from ``state``. `measurements`: of this epoch. `linearization_point`: where to
+        linearise if the prediction is too uncertain; then three iterations. Raises EstimationError
+        if the arithmetic fails; the state is then unchanged.
         """
         self.F, self.Q = predicted.transition, predicted.noise
         self.predict()

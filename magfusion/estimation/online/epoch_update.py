@@ -113,10 +113,7 @@ class EpochUpdate:
     ) -> Judgement:
         """Process the measurements at a prediction, and judge the state.
 
-        Parameters
-        ----------
-        samples : FieldSamples, optional
-            Of this epoch; None where it may have a window.
+        `samples`: of this epoch; None where it may have a window.
         """
         before, state = estimator.state, predicted.state
         if predicted.gap_bridged:
@@ -270,11 +267,7 @@ class EpochUpdate:
         """Return fields that pass the gate, and the fix where they are linearised, if any.
 
         If they restart the state, or the last epochs are undone, return the judgement instead.
-
-        Parameters
-        ----------
-        is_lost : bool
-            Whether the state was lost before.
+        `is_lost`: whether the state was lost before.
         """
         state = predicted.state
         if is_lost and self._found_again(estimator, measured, predicted):

@@ -205,12 +205,7 @@ class EstimationLoop:
     ) -> None:
         """Prepare a trial of a corrected site, for the newest input of another loop.
 
-        Parameters
-        ----------
-        declared : Site
-            Without any correction.
-        span : float
-            Duration of that input (s).
+        `declared`: without any correction. `span`: duration of that input (s).
         """
         reports = earlier.reports
         reasons = (*reports.judgement.reasons, *earlier.search.why.trust.reasons)

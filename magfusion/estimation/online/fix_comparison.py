@@ -5,10 +5,10 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.recovery import AgreedFix, agreed_fix, explains
+from magfusion.estimation.snapshot.fix import AS_LIKELY
 from magfusion.model.samples import FieldSamples
 
 COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes without a request
-AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
 
 
 class FixComparison:
@@ -25,10 +25,7 @@ class FixComparison:
     ) -> tuple[float, float] | None:
         """Return squared distance and offset (m) of a state from a fix, if it is due and usable.
 
-        Parameters
-        ----------
-        requested : bool
-            Whether a fix is due, whenever the last was.
+        `requested`: whether a fix is due, whenever the last was.
         """
         self._since_compared += 1
         due = state.time >= self._compared_at + COMPARED_EVERY

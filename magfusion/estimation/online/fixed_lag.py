@@ -22,12 +22,7 @@ from magfusion.estimation.graph.measurement import Measurement, joined
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.same_epoch import SAME_TIME
-from magfusion.estimation.graph.state import (
-    MOTION,
-    State,
-    moved_to,
-    values_of,
-)
+from magfusion.estimation.graph.state import MOTION, State, moved_to, values_of
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.online.window_prior import WindowPrior, triangular
 from magfusion.estimation.solve.bordered import eliminate_partial
@@ -41,21 +36,11 @@ LAST = slice(MOTION, 2 * MOTION)  # of the first state, the last and the calibra
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One epoch in the window.
+    """One epoch in the window."""
 
-    Parameters
-    ----------
-    state : State
-        Its calibration is the window's.
-    measurements : tuple of Measurement
-        Of this epoch.
-    link : Link, optional
-        From the previous node; None for the first.
-    """
-
-    state: State
-    measurements: tuple[Measurement, ...]
-    link: Link | None
+    state: State  # its calibration is the window's
+    measurements: tuple[Measurement, ...]  # of this epoch
+    link: Link | None  # from the previous node; None for the first
 
 
 class SlidingWindow:
@@ -120,20 +105,9 @@ class SlidingWindow:
 
         Unlike `ErrorStateFilter.absorb`, which solves for one state by a gain, it solves for the
         whole window by elimination.  Both share rows, inertial factor, partial update and chart.
-
-        Parameters
-        ----------
-        predicted : Propagated
-            From ``state``.
-        measurements : sequence of Measurement
-            Of this epoch.
-        linearization_point : State, optional
-            Where to start the iteration, if the prediction is too uncertain.
-
-        Raises
-        ------
-        EstimationError
-            If the window cannot be solved; it is then unchanged.
+        `predicted`: from ``state``. `measurements`: of this epoch. `linearization_point`: where to
+        start the iteration, if the prediction is too uncertain. Raises EstimationError if the
+        window cannot be solved; it is then unchanged.
         """
         kept, solved = dict(vars(self)), False
         nodes, passed = self.nodes or [Node(self.state, (), None)], self._has_passed(0)
@@ -215,10 +189,7 @@ class SlidingWindow:
     def _iterate(self, *, passed: bool = False) -> Array:
         """Take a step; return the covariance of the first state before it.
 
-        Parameters
-        ----------
-        passed : bool
-            Whether the first node leaves, linearised with all others.
+        `passed`: whether the first node leaves, linearised with all others.
         """
         graph, clones = self._linearized(self.nodes), list(range(len(self.clones)))
         begin, leaving = len(clones), self._leaving() if passed else []
@@ -299,12 +270,8 @@ class SlidingWindow:
     def _report_lagged(self, cov: Array) -> None:
         """Output the states that are older than the lag; the last leaves with the next epoch.
 
-        Then the whole window is linearised at its current states, and no node twice.
-
-        Parameters
-        ----------
-        cov : ndarray
-            Of the first state, from the last step; the same one step later.
+        Then the whole window is linearised at its current states, and no node twice. `cov`: of the
+        first state, from the last step; the same one step later.
         """
         while self._has_passed(0):
             self.lagged = replace(self.nodes[0].state, cov=cov)

@@ -14,13 +14,7 @@ def ahead_by_prior(passage: Passage, horizon: float, imu: ImuModel) -> Passage:
     """Return a passage predicted with white accelerations of rate and velocity only.
 
     Without a stream the error of a prediction cannot be measured: it follows from the prior.
-
-    Parameters
-    ----------
-    horizon : float
-        (s)
-    imu : ImuModel
-        Of `magfusion.model.without_imu.on_motion_prior`.
+    `horizon` (s). `imu`: of `magfusion.model.without_imu.on_motion_prior`.
     """
     count = max(1, int(np.ceil(horizon / LONGEST_STEP - 1e-9)))
     length = np.full(len(passage), horizon / count)

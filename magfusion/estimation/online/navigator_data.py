@@ -67,12 +67,8 @@ def navigator_rules(
 ) -> Rules:
     """Return how the parts of a navigator become plain data, and their validity checks.
 
-    Parameters
-    ----------
-    blocks : tuple of Block
-        Calibration parameters in the states' tangent.
-    measurements : tuple of type
-        Kinds of measurements from outside the package.
+    `blocks`: calibration parameters in the states' tangent. `measurements`: kinds of measurements
+    from outside the package.
     """
     declared = initial_calibration(site, 0.0)
     kinds = {kind.__name__: kind for kind in (*MEASUREMENTS, *measurements)}

@@ -11,18 +11,10 @@ from magfusion.model.samples import FieldSamples
 
 
 class NextEpoch(NamedTuple):
-    """An epoch whose data have all arrived.
+    """An epoch whose data have all arrived."""
 
-    Parameters
-    ----------
-    time : float
-        (s)
-    samples : FieldSamples, optional
-        None where it may have a window.
-    """
-
-    time: float
-    samples: FieldSamples | None = None
+    time: float  # (s)
+    samples: FieldSamples | None = None  # None where it may have a window
 
 
 class TooLate(NamedTuple):
@@ -40,10 +32,7 @@ def next_epoch(
 ) -> NextEpoch | TooLate | None:
     """Take the next epoch after a state out of the queue; None where its data are incomplete.
 
-    Parameters
-    ----------
-    needs_separate : callable
-        As of `Arrivals.next_window`.
+    `needs_separate`: as of `Arrivals.next_window`.
     """
     now, delay = state.time, settings.delay
     arrived.receive(state, delay)

@@ -24,60 +24,31 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class PropagationStart:
-    """The state of an epoch, and all that its propagation needs.
+    """The state of an epoch, and all that its propagation needs."""
 
-    Parameters
-    ----------
-    state : State
-        Of the estimator.
-    site : Site
-        Its gravity and the noise of its IMU.
-    blocks : tuple of Block
-        Calibration parameters in the state's tangent.
-    process_noise : ProcessNoise
-        Of the calibration.
-    time_offset : float
-        Added to the IMU's stamps (s).
-    usual : float
-        Sampling interval of the IMU (s).
-    """
-
-    state: State
-    site: Site
-    blocks: tuple[Block, ...]
-    process_noise: ProcessNoise
-    time_offset: float
-    usual: float
+    state: State  # of the estimator
+    site: Site  # its gravity and the noise of its IMU
+    blocks: tuple[Block, ...]  # calibration parameters in the state's tangent
+    process_noise: ProcessNoise  # of the calibration
+    time_offset: float  # added to the IMU's stamps (s)
+    usual: float  # sampling interval of the IMU (s)
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """Propagated states, and their transition and noise since the epoch.
+    """Propagated states, and their transition and noise since the epoch."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world, velocity_world : ndarray, shape (n, 3)
-        (m, m/s)
-    gyro_body, accel_body : ndarray, shape (n, 3)
-        At these times, without bias (rad/s, m/s^2).
-    transition : ndarray, shape (n, 15, 15 or 15 + calibration)
-        From the tangent of the epoch's state to errors as defined by
-        `magfusion.estimation.graph.dead_reckoning_error`.
-    noise : ndarray, shape (n, 15, 15)
-        Covariance of these errors that is added since the epoch.
-    """
-
-    time: Array
-    world_from_body: Array
-    position_world: Array
-    velocity_world: Array
+    time: Array  # (n,) (s)
+    world_from_body: Array  # (n, 3, 3)
+    position_world: Array  # (n, 3) (m)
+    velocity_world: Array  # (n, 3) (m/s)
+    # gyro_body, accel_body: (n, 3), at these times, without bias (rad/s, m/s^2)
     gyro_body: Array
     accel_body: Array
+    # (n, 15, 15 or 15 + calibration), from the tangent of the epoch's state to errors as defined by
+    # `magfusion.estimation.graph.dead_reckoning_error`
     transition: Array
-    noise: Array
+    noise: Array  # (n, 15, 15), covariance of these errors that is added since the epoch
 
     def __len__(self) -> int:
         return len(self.time)
@@ -202,14 +173,8 @@ def _by_calibration(start: PropagationStart, imu: ImuSamples, grid: Array) -> Ar
 def ahead(passage: Passage, horizon: float, gravity: float, cov_body: Array) -> Passage:
     """Return a passage extrapolated with constant rate and constant specific force in world axes.
 
-    Parameters
-    ----------
-    horizon : float
-        (s)
-    gravity : float
-        (m/s^2)
-    cov_body : ndarray, shape (9, 9)
-        Of rotation, position and velocity: the cost of that assumption.
+    `horizon` (s), `gravity` (m/s^2). `cov_body` (9, 9): of rotation, position and velocity: the
+    cost of that assumption.
     """
     count = len(passage)
     length = np.full(count, horizon)

@@ -21,19 +21,9 @@ def restored(
 ) -> Navigator:
     """Return the navigator of a checkpoint.
 
-    Parameters
-    ----------
-    site, settings
-        Of the navigator that made it.
-    checkpoint : dict
-        As returned by `Navigator.checkpoint`.
-    measurements : tuple of type
-        Kinds of measurements from outside the package that were added to it.
-
-    Raises
-    ------
-    InputError
-        If it is no checkpoint, or does not fit the site.
+    `site`, `settings`: of the navigator that made it. `checkpoint`: as returned by
+    `Navigator.checkpoint`. `measurements`: kinds of measurements from outside the package that were
+    added to it. Raises InputError if it is no checkpoint, or does not fit the site.
     """
     parts = checkpoint.get("parts") if isinstance(checkpoint, dict) else None
     loop = parts.get("_loop") if isinstance(parts, dict) else None

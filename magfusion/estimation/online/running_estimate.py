@@ -29,14 +29,8 @@ from magfusion.units import Array
 class RunningEstimate:
     """A filter or a sliding window with its propagation and its update.
 
-    Attributes
-    ----------
-    estimator : SlidingWindow or ErrorStateFilter, optional
-        None before the first state.
-    estimated, blocks : tuple of Block
-        Calibration parameters that are estimated, and all in the states' tangent.
-    process_noise : ProcessNoise
-        Of all blocks.
+    `estimator`: None before the first state. `estimated`, `blocks`: calibration parameters that are
+    estimated, and all in the states' tangent. `process_noise`: of all blocks.
     """
 
     update: EpochUpdate
@@ -93,10 +87,7 @@ class RunningEstimate:
     ) -> tuple[Propagated, Judgement]:
         """Propagate to a time (s) and process its measurements; return prediction and judgement.
 
-        Parameters
-        ----------
-        samples : FieldSamples, optional
-            Of this epoch; None where it may have a window.
+        `samples`: of this epoch; None where it may have a window.
         """
         assert self.estimator is not None
         before = self.estimator.state
@@ -132,12 +123,7 @@ class RunningEstimate:
     # GTSAM factors of the user
 
     def check_factor_times(self, time: Array) -> None:
-        """Refuse factors on states (s) that the estimator does not have and will not make.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse factors on states (s) that the estimator does not have and will not make."""
         name = ", ".join(f"{t:g}" for t in time)
         if len(time) == 0 or np.any(np.diff(time) < 2.0 * SAME_TIME):
             raise InputError(

@@ -24,14 +24,8 @@ LONGEST = 4.0  # durations of a start; as much is kept, and an open hypothesis w
 class StartSearch:
     """Attempts at a first state, each on more data than the one before.
 
-    Attributes
-    ----------
-    needed : float
-        Duration of data before the next attempt (s).
-    why : NoStart
-        Why there is no state yet.
-    earlier : State, optional
-        Whose biases and calibration the first state takes over.
+    `needed`: duration of data before the next attempt (s). `why`: why there is no state yet.
+    `earlier`: whose biases and calibration the first state takes over.
     """
 
     needed: float

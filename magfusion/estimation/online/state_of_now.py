@@ -33,41 +33,26 @@ from magfusion.units import DEGREE, Array
 
 @dataclass(frozen=True, eq=False)
 class PropagatedState(JudgedState):
-    """A state that is propagated by inertial samples.
-
-    Parameters
-    ----------
-    epoch : float
-        Time of the estimate that was propagated (s).
-    """
+    """A state that is propagated by inertial samples."""
 
     __repr__ = short_repr
 
-    epoch: float = 0.0
+    epoch: float = 0.0  # time of the estimate that was propagated (s)
 
 
 @dataclass(frozen=True, eq=False)
 class EpochReport:
-    """Judgement and levels that all states propagated from one epoch share.
-
-    Parameters
-    ----------
-    bank : SubsetBank, optional
-        The filters that exclude each beacon, of that epoch.
-    """
+    """Judgement and levels that all states propagated from one epoch share."""
 
     judgement: Judgement
     reset_counter: int
-    bank: SubsetBank | None
+    bank: SubsetBank | None  # the filters that exclude each beacon, of that epoch
 
 
 class StateOfNow:
     """Propagates the newest estimate to the newest inertial sample, or ahead of it.
 
-    Attributes
-    ----------
-    pending : list of PropagatedState
-        At the requested rate, in order of time.
+    `pending`: at the requested rate, in order of time.
     """
 
     pending: list[PropagatedState]

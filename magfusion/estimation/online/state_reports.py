@@ -18,19 +18,8 @@ from magfusion.estimation.online_integrity.summary import Summary
 class StateReports:
     """States of epochs, not taken yet, and what is known of all.
 
-    Parameters
-    ----------
-    lagged : bool
-        Whether states are reported again when they leave a window.
-
-    Attributes
-    ----------
-    judgement : Judgement
-        Of the newest state.
-    discontinuities : DiscontinuityCounter
-    summary : Summary
-    until : float
-        Time of the last state that was taken (s).
+    `lagged`: whether states are reported again when they leave a window. `judgement`: of the newest
+    state. `until`: time of the last state that was taken (s).
     """
 
     judgement: Judgement

@@ -16,14 +16,9 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class WindowPrior:
-    """``|sqrt_information @ step - right|^2``, steps from its points to the states.
+    """``|sqrt_information @ step - right|^2``, steps from its points to the states."""
 
-    Parameters
-    ----------
-    linearization_points : tuple of State
-        Of the clones, then of the first node, whose step ends with the calibration's.
-    """
-
+    # of the clones, then of the first node, whose step ends with the calibration's
     linearization_points: tuple[State, ...]
     sqrt_information: Array
     right: Array
@@ -52,12 +47,8 @@ class WindowPrior:
     def predicted(self, noise: Array, considered_cov: Array, share: Array | None) -> "WindowPrior":
         """Return the prior with calibration drift added and considered parameters unlearnt.
 
-        Parameters
-        ----------
-        noise : ndarray, shape (calibration, calibration)
-            Covariance of the drift.
-        considered_cov, share : ndarray
-            Of the first node's state, as in `partial_update`.
+        `noise` (calibration, calibration): covariance of the drift. `considered_cov`, `share`: of
+        the first node's state, as in `partial_update`.
         """
         if share is None and not np.any(noise > 0.0):
             return self

@@ -29,15 +29,10 @@ GATE_AGAIN = {k: float(chdtri(k, FALSE_REJECTIONS_AGAIN)) for k in FREEDOM}
 class AidingGate:
     """Rejects samples of aiding sensors that the predicted state does not explain.
 
-    Attributes
-    ----------
-    rejected_since : dict of str to float
-        Of each sensor whose last sample was rejected, the time of the first such in a row (s).
-    rejected_share : dict of str to float
-        Decaying mean of its rejections.
-    rejected : tuple of Measurement
-        Samples of the last epoch that were rejected, at a state that is known better than they
-        measure: they show what is wrong with their sensor.
+    `rejected_since`: of each sensor whose last sample was rejected, the time of the first such in a
+    row (s). `rejected_share`: decaying mean of its rejections. `rejected`: samples of the last
+    epoch that were rejected, at a state that is known better than they measure: they show what is
+    wrong with their sensor.
     """
 
     rejected_since: dict[str, float]
@@ -78,10 +73,7 @@ class AidingGate:
     def assessed(self, judgement: Judgement, time: float, explained: Collection[str]) -> Judgement:
         """Return a judgement with the sensors that contradict the state without a known cause.
 
-        Parameters
-        ----------
-        explained : collection of str
-            Sensors of which a parameter is named by the score test.
+        `explained`: sensors of which a parameter is named by the score test.
         """
         contradicting = {
             sensor: share

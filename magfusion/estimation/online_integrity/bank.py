@@ -29,6 +29,8 @@ from magfusion.estimation.online_integrity.levels import Levels, LevelsQuery
 from magfusion.estimation.posterior.separation import (
     MIN_COUNT,
     OPEN_POSITION,
+    OPEN_ROTATION,
+    SLACK,
     Separation,
     radii,
 )
@@ -39,23 +41,17 @@ from magfusion.model.trust import Finding, Risk, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
 MAX_FILTERS = 6  # filters without beacons; with more beacons some share one
-SLACK = 3.0  # sigma; smaller deviations are covered
 # Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
 NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no source, or to all beacons
-OPEN_ROTATION = 0.3  # rad; beyond, nothing else determines the attitude
 OPEN = np.repeat([OPEN_ROTATION, OPEN_POSITION, OPEN_POSITION], 3)  # of a filter without a sensor
 
 
 class SubsetBank:
     """Filters without each beacon, or each of a few groups of them, and without each sensor.
 
-    Parameters
-    ----------
-    blocks : tuple of Block
-        Calibration parameters in the states' tangent.
-    considered : int
-        Parameters at the tangent's end that are considered, not estimated.
+    `blocks`: calibration parameters in the states' tangent. `considered`: parameters at the
+    tangent's end that are considered, not estimated.
     """
 
     _step: Array | None  # (groups, n); deviation of each filter from the estimate
@@ -84,10 +80,7 @@ class SubsetBank:
     def check(self, size: int) -> None:
         """Check that the filters of a checkpoint fit states of a size.
 
-        Raises
-        ------
-        ValueError
-            If they do not.
+        Raises ValueError if they do not.
         """
         parts = (self._step, self._cov, self._joint, self._common)
         if all(part is None for part in parts):
@@ -112,14 +105,8 @@ class SubsetBank:
     ) -> None:
         """Update the filters to the new estimate.
 
-        Parameters
-        ----------
-        predicted : Propagated
-            From the previous estimate.
-        measurements : sequence of Measurement
-            Of this epoch, as the estimate used them.
-        after : State
-            The estimate.
+        `predicted`: from the previous estimate. `measurements`: of this epoch, as the estimate used
+        them. `after`: the estimate.
         """
         if self._step is None or self._step.shape[1] != len(after.cov):
             self._begin(after)
@@ -234,11 +221,8 @@ class SubsetBank:
     def _selected(self, rows: Array, owner: IntArray, spans: list[Array]) -> Array:
         """Return the rows that each filter uses, zero for those it excludes.
 
-        Parameters
-        ----------
-        rows : ndarray, shape (rows, k) or (1 + groups, rows, k)
-        spans : list of ndarray, shape (rows, p)
-            Orthonormal basis of each group's part of jointly measured tones.
+        `rows` (rows, k) or (1 + groups, rows, k). `spans` (rows, p) each: orthonormal basis of each
+        group's part of jointly measured tones.
         """
         rows = np.broadcast_to(rows, (1 + self.groups, *rows.shape[-2:]))
         # The first filter excludes no beacon.
@@ -338,13 +322,8 @@ class SubsetBank:
 
         Attitude, then position.  They bound the growth of every norm in a level: of the estimate,
         of a filter without a beacon, and of their distance.
-
-        Parameters
-        ----------
-        transition : ndarray, shape (n, 15, 15 or 15 + calibration)
-            From the state of the last epoch.
-        noise : ndarray, shape (n, 15, 15)
-            Added since then.
+        `transition` (n, 15, 15 or 15 + calibration): from the state of the last epoch.
+        `noise` (n, 15, 15): added since then.
         """
         if self._cov is None or self._joint is None:
             return np.ones((len(transition), 2))

@@ -35,10 +35,7 @@ MOST_ONSETS = 6  # times of tested steps; the older ones are farther apart
 class BeaconSteps:
     """The tested steps: of the pose of each beacon with an estimated one.
 
-    Parameters
-    ----------
-    estimated : tuple of Block
-        Calibration parameters in the state's tangent.
+    `estimated`: calibration parameters in the state's tangent.
     """
 
     def __init__(self, site: Site, estimated: tuple[Block, ...]) -> None:

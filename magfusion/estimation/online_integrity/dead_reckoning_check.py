@@ -19,21 +19,11 @@ LATE = 0.5  # s; largest delay of the detection of a disturbance
 
 @dataclass(frozen=True, eq=False)
 class SlidingUpdate:
-    """Corrections since a time.
+    """Corrections since a time."""
 
-    Parameters
-    ----------
-    time : float
-        (s)
-    correction : ndarray, shape (15 + calibration,)
-        Of the state, propagated.
-    cov : ndarray, shape (15 + calibration, 15 + calibration)
-        Of the state without it.
-    """
-
-    time: float
-    correction: Array
-    cov: Array
+    time: float  # (s)
+    correction: Array  # (15 + calibration,), of the state, propagated
+    cov: Array  # (15 + calibration, 15 + calibration), of the state without it
 
 
 class DeadReckoningCheck:

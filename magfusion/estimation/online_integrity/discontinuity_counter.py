@@ -14,12 +14,7 @@ class DiscontinuityCounter:
     """Counts the jumps of a running estimate.
 
     It jumps where a lost state is recovered, where another hypothesis replaces it, and where a
-    correction is larger than the prior covariance explains.
-
-    Attributes
-    ----------
-    counter : int
-        Jumps so far.
+    correction is larger than the prior covariance explains. `counter`: jumps so far.
     """
 
     counter: int
@@ -34,14 +29,9 @@ class DiscontinuityCounter:
     ) -> bool:
         """Process an update; return whether the estimate jumped.
 
-        Parameters
-        ----------
-        predicted, state : State
-            Before and after the update, at one time.
-        before, now : Judgement
-            Of the previous state, and of this one.
-        restarts : int
-            Number of fixes that have replaced the state up to now.
+        `predicted`, `state`: before and after the update, at one time. `before`, `now`: of the
+        previous state, and of this one. `restarts`: number of fixes that have replaced the state up
+        to now.
         """
         restarted, self._restarts = restarts > self._restarts, restarts
         was_lost, self._is_lost = self._is_lost, now.verdict is Verdict.FAILED

@@ -66,10 +66,7 @@ class Gate:
     def begin(self, noise_freedom: Mapping[str, float]) -> None:
         """Set the limits by the degrees of freedom of each beacon's estimated noise.
 
-        Parameters
-        ----------
-        noise_freedom : mapping of str to float
-            By beacon; the noise of one without is known.
+        `noise_freedom`: by beacon; the noise of one without is known.
         """
         freedom = [noise_freedom.get(name, np.inf) for name in self._names]
         limit = [COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, f) for f in freedom]
@@ -91,12 +88,8 @@ class Gate:
     ) -> Phasors:
         """Return the measurements without the channels that a state does not explain.
 
-        Parameters
-        ----------
-        measurements : FieldPhasors or JointPhasors
-            Of one epoch.
-        valid, refused : bool ndarray, shape (channels,)
-            Channels that the epoch contains, and those that are already rejected.
+        `measurements`: of one epoch. `valid`, `refused` (channels,): channels that the epoch
+        contains, and those that are already rejected.
         """
         distance = measurements.alone().distances(state, self.blocks, self._limit)
         beyond: BoolArray = np.asarray(distance > self._limit)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from magfusion.estimation.data_checks.running import DecayingSums
+from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.steady_field import DOUBT
 from magfusion.estimation.graph.preintegration import bias_walks
 from magfusion.estimation.graph.state import State
@@ -11,7 +12,6 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 
 LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
-DETECTION_SIGMAS = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
 START_SPAN = 6.0  # s; of the data before the first state, over which a bias walks, too
 TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
@@ -55,12 +55,8 @@ def judge_biases(site: Site, state: State, elapsed: float) -> Judgement:
 def judge_gravity(site: Site, residual: DecayingSums, memory: float) -> Judgement:
     """Test the residual of the mean specific force: no platform falls for seconds.
 
-    Parameters
-    ----------
-    residual : DecayingSums
-        Mean specific force minus gravity, world axes (m/s^2), weighted by time.
-    memory : float
-        Its time constant (s).
+    `residual`: mean specific force minus gravity, world axes (m/s^2), weighted by time. `memory`:
+    its time constant (s).
     """
     span = residual.weight  # s of data, without the gaps of the IMU
     if span < LEAST_SPAN or not site.platform.inertial:

@@ -15,30 +15,16 @@ from magfusion.units import Array
 
 @dataclass(frozen=True)
 class Judgement:
-    """Combined result of the monitors of a state.
+    """Combined result of the monitors of a state."""
 
-    Parameters
-    ----------
-    findings : tuple of Finding
-        A failed one means that the platform is lost.
-    excluded : tuple of str
-        Beacons that the gate rejected at this epoch.
-    inflation : float
-        Of the whole covariance, at least one.
-    turn, shift : float
-        Additional error of attitude (rad) and position (m), one sigma per axis.
-    levels : Levels, optional
-        None where there are none.
-    detected : tuple of str
-        Beacons that are detected there, with the motion inside the window compensated.
-    """
-
-    findings: tuple[Finding, ...] = ()
-    excluded: tuple[str, ...] = ()
-    inflation: float = 1.0
+    findings: tuple[Finding, ...] = ()  # a failed one means that the platform is lost
+    excluded: tuple[str, ...] = ()  # beacons that the gate rejected at this epoch
+    inflation: float = 1.0  # of the whole covariance, at least one
+    # turn, shift: additional error of attitude (rad) and position (m), one sigma per axis
     turn: float = 0.0
     shift: float = 0.0
-    levels: Levels | None = None
+    levels: Levels | None = None  # None where there are none
+    # beacons that are detected there, with the motion inside the window compensated
     detected: tuple[str, ...] = ()
 
     @property
@@ -100,20 +86,14 @@ class TimedJudgement:
 
 @dataclass(frozen=True, eq=False)
 class JudgedState(State):
-    """A state with its judgement, and its covariance enlarged accordingly.
-
-    Parameters
-    ----------
-    judgement : Judgement
-    reset_counter : int
-        Number of pose jumps up to here, as counted by
-        `magfusion.estimation.online_integrity.discontinuity_counter`; users of pose increments
-        must restart where it rises.
-    """
+    """A state with its judgement, and its covariance enlarged accordingly."""
 
     __repr__ = short_repr
 
     judgement: Judgement = Judgement()
+    # number of pose jumps up to here, as counted by
+    # `magfusion.estimation.online_integrity.discontinuity_counter`; users of pose increments must
+    # restart where it rises
     reset_counter: int = 0
 
     @property

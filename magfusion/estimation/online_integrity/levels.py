@@ -19,39 +19,22 @@ _PARTS = tuple(part.name for part in fields(Separation))
 
 
 class LevelsQuery(NamedTuple):
-    """Arguments from which the levels of a state are computed.
+    """Arguments from which the levels of a state are computed."""
 
-    Parameters
-    ----------
-    separation : Separation
-        Of one epoch.
-    slack : float
-        As of `magfusion.estimation.posterior.protection_levels.protection_levels`, as are
-    risk : Risk
-    prior : ndarray, shape (1, beacons)
-    factor : float
-        Inflation of the levels by other monitors.
-    more : tuple of float
-        Additional margin (m, deg).
-    """
-
-    separation: Separation
+    separation: Separation  # of one epoch
+    # as of `magfusion.estimation.posterior.protection_levels.protection_levels`, as are
     slack: float
     risk: Risk
-    prior: Array
-    factor: float
-    more: tuple[float, float]
+    prior: Array  # (1, beacons)
+    factor: float  # inflation of the levels by other monitors
+    more: tuple[float, float]  # additional margin (m, deg)
 
 
 class Levels:
     """The protection levels of a state.
 
-    Parameters
-    ----------
-    values : tuple of float, optional
-        Position (m) and attitude (deg); None for a level that does not exist.
-    query : LevelsQuery, optional
-        Arguments of levels that are not computed yet.
+    `values`: position (m) and attitude (deg); None for a level that does not exist. `query`:
+    arguments of levels that are not computed yet.
     """
 
     def __init__(

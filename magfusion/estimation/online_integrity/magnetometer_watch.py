@@ -17,14 +17,8 @@ MIN_EPOCHS = 20  # epochs of its own, before one is assessed
 class MagnetometerWatch:
     """Tracks the share of each magnetometer's phasors that the state does not explain.
 
-    Attributes
-    ----------
-    share : dict of str to float
-        By magnetometer.
-    epochs : dict of str to int
-        Number of epochs with any of its phasors.
-    excluded : list of str
-        Those that the first state excludes.
+    `share`: by magnetometer. `epochs`: number of epochs with any of its phasors. `excluded`: those
+    that the first state excludes.
     """
 
     share: dict[str, float]
@@ -55,10 +49,7 @@ class MagnetometerWatch:
     def update(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
         """Process the channels that a state does not explain; return the excluded ones.
 
-        Returns
-        -------
-        bool ndarray, shape (channels,)
-            All channels of faulty magnetometers.
+        Returns (channels,): all channels of faulty magnetometers.
         """
         out = np.zeros(len(valid), dtype=bool)
         for k, name in enumerate(self._names):

@@ -66,11 +66,7 @@ class NearMetal:
     def weighed(self, phasors: FieldPhasors, state: State, valid: BoolArray) -> FieldPhasors:
         """Return the phasors of an epoch, weighted for nearby metal.
 
-        Parameters
-        ----------
-        state : State
-            The prediction, with its own covariance.
-        valid : bool ndarray, shape (channels,)
+        `state`: the prediction, with its own covariance. `valid` (channels,).
         """
         if not self.single or not np.any(valid):
             return phasors
@@ -148,10 +144,7 @@ def _with_share(
 ) -> FieldPhasors:
     """Return phasors with an additional error that a number of epochs share.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (channels,)
-        (T^2)
+    `variance` (channels,) (T^2).
     """
     given = phasors.sqrt_information[0, :, :3, :3]
     some = np.any(given, axis=2) & valid[:, None]  # components that the receiver lacks are zero

@@ -17,10 +17,7 @@ from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
-from magfusion.estimation.online_integrity.imu_checks import (
-    judge_biases,
-    judge_gravity,
-)
+from magfusion.estimation.online_integrity.imu_checks import judge_biases, judge_gravity
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.parameters import (
     Block,
@@ -59,34 +56,20 @@ PROBATION = 2.0  # s; after a recovery or a failed update
 
 @dataclass(frozen=True, eq=False)
 class EpochSummary:
-    """Data of an epoch besides the state.
+    """Data of an epoch besides the state."""
 
-    Parameters
-    ----------
-    accel_world : ndarray, shape (3,), optional
-        Mean acceleration since the previous epoch by the raw accelerometer, in world axes, the
-        residual of gravity (m/s^2).
-    elapsed : float
-        Since that epoch (s).
-    steady : SteadyFields, optional
-        The static field of the window.
-    repeats : float
-        Number of epochs that contain each sample of overlapping windows.
-    """
-
+    # (3,), mean acceleration since the previous epoch by the raw accelerometer, in world axes, the
+    # residual of gravity (m/s^2)
     accel_world: Array | None = None
-    elapsed: float = 0.0
-    steady: SteadyFields | None = None
-    repeats: float = 1.0
+    elapsed: float = 0.0  # since that epoch (s)
+    steady: SteadyFields | None = None  # the static field of the window
+    repeats: float = 1.0  # number of epochs that contain each sample of overlapping windows
 
 
 class OnlineMonitor:
     """Monitors of a running estimate.
 
-    Parameters
-    ----------
-    estimated : tuple of Block
-        Calibration parameters that are estimated, first in the state's tangent.
+    `estimated`: calibration parameters that are estimated, first in the state's tangent.
     """
 
     _level: dict[str, DecayingSums]
@@ -129,12 +112,8 @@ class OnlineMonitor:
     ) -> None:
         """Start at a first state (s), with the judgement of the smoothed beginning.
 
-        Parameters
-        ----------
-        shared_offsets : mapping of str to ndarray
-            Variance of estimated parameters that is due to considered ones.
-        noise_freedom : mapping of str to float
-            Degrees of freedom of each beacon's estimated noise; one without is known.
+        `shared_offsets`: variance of estimated parameters that is due to considered ones.
+        `noise_freedom`: degrees of freedom of each beacon's estimated noise; one without is known.
         """
         self._began, self._beginning, self._shared_offsets = time, findings, dict(shared_offsets)
         self._noise_freedom = dict(noise_freedom)
@@ -181,10 +160,7 @@ class OnlineMonitor:
     def compared(self, distance: float, off: float) -> None:
         """Process the comparison with a fix: squared distance and offset (m).
 
-        Parameters
-        ----------
-        distance : float
-            Chi square of six components.
+        `distance`: chi square of six components.
         """
         if distance < chdtri(6, 1e-6):
             self._elsewhere, self._elsewhere_times = None, 0

@@ -27,16 +27,10 @@ BIAS_LIMIT = 6.0  # prior sigmas; a larger bias is the result of a wrong pose
 
 
 class AgreedFix(NamedTuple):
-    """A fix of one epoch.
-
-    Parameters
-    ----------
-    refused : bool ndarray, shape (channels,)
-        Of beacons that disagree with the others.
-    """
+    """A fix of one epoch."""
 
     fixes: Fixes
-    refused: BoolArray
+    refused: BoolArray  # (channels,), of beacons that disagree with the others
 
     @property
     def excess(self) -> float:
@@ -47,10 +41,7 @@ class AgreedFix(NamedTuple):
 class Attempts:
     """Times of attempts at a fix: at once, then after waits that double up to `LONGEST_WAIT`.
 
-    Attributes
-    ----------
-    lost_since : float, optional
-        When the platform was lost (s); None where it is not.
+    `lost_since`: when the platform was lost (s); None where it is not.
     """
 
     lost_since: float | None
@@ -162,19 +153,8 @@ def agreed_fix(
 ) -> AgreedFix | None:
     """Fix an epoch without the smallest set of beacons that prevents agreement.
 
-    If no subset agrees (a model that is wrong everywhere), all are used.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        One epoch.
-    prior : Trajectory, optional
-        With it a single beacon suffices.
-
-    Returns
-    -------
-    AgreedFix or None
-        None where there is no fix at all.
+    If no subset agrees (a model that is wrong everywhere), all are used. `samples`: one epoch.
+    `prior`: with it a single beacon suffices. Returns None where there is no fix at all.
     """
     owner = np.array([name for name, _ in samples.channels])
     detected = list(dict.fromkeys(owner[samples.valid[0]].tolist()))

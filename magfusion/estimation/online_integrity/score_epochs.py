@@ -31,63 +31,32 @@ class Sums:
     """Sums over the innovations up to now, in typical errors of the fixed parameters.
 
     After these h parameters follow those of `magfusion.estimation.online_integrity.beacon_steps`.
-
-    Parameters
-    ----------
-    information : ndarray, shape (h + k, h + k)
-    gradient : ndarray, shape (h + k,)
-    response : ndarray, shape (15 + estimated, h + k)
-        Effect of a unit error of these on the state.
-    time : float
-        (s)
-    onsets : tuple of float
-        Times of the tested steps (s).
     """
 
-    information: Array
-    gradient: Array
-    response: Array
-    time: float
-    onsets: tuple[float, ...] = ()
+    information: Array  # (h + k, h + k)
+    gradient: Array  # (h + k,)
+    response: Array  # (15 + estimated, h + k), effect of a unit error of these on the state
+    time: float  # (s)
+    onsets: tuple[float, ...] = ()  # times of the tested steps (s)
 
 
 class EpochTransition(NamedTuple):
-    """Propagation to an epoch.
+    """Propagation to an epoch."""
 
-    Parameters
-    ----------
-    transition : ndarray, shape (n, n)
-        Of the tangent.
-    world_from_body : tuple of ndarray, shape (3, 3)
-        Before and after.
-    gyro_body, accel_body : ndarray, shape (3,)
-        Their means (rad/s, m/s^2); zero where nothing was measured.
-    """
-
-    transition: Array
-    world_from_body: tuple[Array, Array]
+    transition: Array  # (n, n), of the tangent
+    world_from_body: tuple[Array, Array]  # (3, 3) each, before and after
+    # gyro_body, accel_body: (3,), their means (rad/s, m/s^2); zero where nothing was measured
     gyro_body: Array
     accel_body: Array
 
 
 class Epoch(NamedTuple):
-    """A pending epoch.
-
-    Parameters
-    ----------
-    predicted : State
-    passed : EpochTransition, optional
-        None where the state was not propagated.
-    measurements : tuple of Measurement
-        After the gate.
-    rejected : tuple of Measurement
-        Innovations that did not update the state.
-    """
+    """A pending epoch."""
 
     predicted: State
-    passed: EpochTransition | None
-    measurements: tuple[Measurement, ...] = ()
-    rejected: tuple[Measurement, ...] = ()
+    passed: EpochTransition | None  # None where the state was not propagated
+    measurements: tuple[Measurement, ...] = ()  # after the gate
+    rejected: tuple[Measurement, ...] = ()  # innovations that did not update the state
 
 
 def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> EpochTransition:

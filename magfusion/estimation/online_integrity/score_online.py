@@ -172,12 +172,7 @@ class OnlineScore:
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
         """Propagate the response to a prediction.
 
-        Parameters
-        ----------
-        transition : ndarray, shape (n, n)
-            Of the tangent.
-        imu : ImuSamples
-            Of the interval.
+        `transition` (n, n): of the tangent. `imu`: of the interval.
         """
         if self._sums is not None:
             self._waiting.append(Epoch(after, passed(before, after, transition, imu)))

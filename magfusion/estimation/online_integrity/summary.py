@@ -18,16 +18,10 @@ QUIET_FACTOR = 10.0  # times as long without it
 
 @dataclass(frozen=True)
 class Noted:
-    """The strongest finding of a code, and the states that have it.
-
-    Parameters
-    ----------
-    first, last : float
-        Of those states (s).
-    states : int
-    """
+    """The strongest finding of a code, and the states that have it."""
 
     finding: Finding
+    # first, last: of those states (s)
     first: float
     last: float
     states: int = 1
@@ -36,12 +30,9 @@ class Noted:
 class Summary:
     """Summary of all states up to now.
 
-    Attributes
-    ----------
-    unverified : tuple of Unverified
-        Parameters that the beginning could not check.
-    lost_states, lost_time, longest_loss : int, float, float
-        Number of lost states, their total and their longest duration until recovery (s).
+    `unverified`: parameters that the beginning could not check. `lost_states`, `lost_time`,
+    `longest_loss`: number of lost states, their total and their longest duration until recovery
+    (s).
     """
 
     unverified: tuple[Unverified, ...]

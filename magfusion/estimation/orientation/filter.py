@@ -25,7 +25,6 @@ from magfusion.estimation.orientation.layout import (
     GYRO_MATRIX,
     LAG,
     MATRIX,
-    MICROTESLA,
     NEAR,
     OFFSET,
     SIZE,
@@ -44,9 +43,9 @@ from magfusion.model.field import observe_earth, skew
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.site import Site
 from magfusion.model.strapdown import triad
-from magfusion.units import Array
+from magfusion.units import MICROTESLA, Array
 
-GYRO_SCALE = ACCEL_SCALE = 0.003  # usual error of an instrument's scale and axes
+INSTRUMENT_SCALE = 0.003  # usual error of an instrument's scale and axes
 # A MEMS gyroscope's sensitivity to specific force, in data sheets 0.1 deg/s/g; (rad/s)/(m/s^2).
 GYRO_FORCE_SIGMA = np.deg2rad(0.1) / 9.80665
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
@@ -71,27 +70,16 @@ ARM_LENGTH = 0.5  # m; of a human arm, each component
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """One processed segment, as needed by a smoother.
-
-    Parameters
-    ----------
-    predicted, state : Orientation
-        Before and after the measurements of its end.
-    transition : ndarray, shape (61, 61)
-    attitude : ndarray, shape (n + 1, 3, 3)
-        ``begin_from_then`` at its samples.
-    disturbance : float
-        Usual deviation of the field then (uT).
-    changed : bool
-        Whether the field was inconsistent with the model, and its disturbance was estimated again.
-    """
+    """One processed segment, as needed by a smoother."""
 
     stretch: OrientationStretch
+    # predicted, state: before and after the measurements of its end
     predicted: Orientation
     state: Orientation
-    transition: Array
-    attitude: Array
-    disturbance: float
+    transition: Array  # (61, 61)
+    attitude: Array  # (n + 1, 3, 3), ``begin_from_then`` at its samples
+    disturbance: float  # usual deviation of the field then (uT)
+    # whether the field was inconsistent with the model, and its disturbance was estimated again
     changed: bool
 
 
@@ -107,15 +95,7 @@ class Row:
 class OrientationFilter:
     """Running estimate of orientation.
 
-    Parameters
-    ----------
-    site : Site
-        Its beacons are ignored.
-
-    Raises
-    ------
-    InputError
-        Where it has no Earth field, or no gravity.
+    `site`: its beacons are ignored. Raises InputError where it has no Earth field, or no gravity.
     """
 
     def __init__(self, site: Site) -> None:
@@ -180,9 +160,9 @@ class OrientationFilter:
             cov = np.zeros((SIZE, SIZE))
             cov[GYRO_BIAS, GYRO_BIAS] = imu.gyro_bias_sigma**2 * np.eye(3)
             cov[ACCEL_BIAS, ACCEL_BIAS] = imu.accel_bias_sigma**2 * np.eye(3)
-            cov[GYRO_MATRIX, GYRO_MATRIX] = GYRO_SCALE**2 * np.eye(9)
+            cov[GYRO_MATRIX, GYRO_MATRIX] = INSTRUMENT_SCALE**2 * np.eye(9)
             cov[GYRO_FORCE, GYRO_FORCE] = GYRO_FORCE_SIGMA**2 * np.eye(9)
-            cov[ACCEL_MATRIX, ACCEL_MATRIX] = ACCEL_SCALE**2 * np.eye(9)
+            cov[ACCEL_MATRIX, ACCEL_MATRIX] = INSTRUMENT_SCALE**2 * np.eye(9)
             cov[ARM, ARM] = ARM_LENGTH**2 * np.eye(3)
             cov[OFFSET, OFFSET] = np.diag((sensor.sigma.offset / MICROTESLA) ** 2)
             cov[NEAR, NEAR] = self._least * np.eye(3)

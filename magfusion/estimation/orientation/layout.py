@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
 
-MICROTESLA = 1e-6  # T
-
 TURN, SPEED = slice(0, 3), slice(3, 6)
 GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
 OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)
@@ -25,50 +23,28 @@ SIZE = 61
 
 @dataclass(frozen=True, eq=False)
 class Orientation:
-    """Attitude and other estimates, at one time.
+    """Attitude and other estimates, at one time."""
 
-    Parameters
-    ----------
-    time : float
-        (s)
-    world_from_body : ndarray, shape (3, 3)
-    velocity_world : ndarray, shape (3,)
-        Kept near zero within the usual speed (m/s).
-    gyro_bias, accel_bias : ndarray, shape (3,)
-        Body axes (rad/s, m/s^2).
-    gyro_matrix : ndarray, shape (3, 3)
-        True rate = (1 + matrix) measured rate - bias - force matrix times measured force.
-    gyro_force, accel_matrix : ndarray, shape (3, 3)
-        True force = (1 + matrix) measured force - bias.
-    arm : ndarray, shape (3,)
-        From the point that the platform swings about to its sensor, body axes (m).
-    offset : ndarray, shape (3,)
-        Of the magnetometer, measured axes (uT).
-    matrix : ndarray, shape (3, 3)
-        Of the magnetometer.
-    near, far : ndarray, shape (3,)
-        Deviation of the field from the declared one, world axes (uT): local and present, and
-        everywhere.
-    lag : float
-        Delay of the field samples relative to the inertial samples (s).
-    cov : ndarray, shape (61, 61)
-    """
-
-    time: float
-    world_from_body: Array
-    velocity_world: Array
+    time: float  # (s)
+    world_from_body: Array  # (3, 3)
+    velocity_world: Array  # (3,), kept near zero within the usual speed (m/s)
+    # gyro_bias, accel_bias: (3,), body axes (rad/s, m/s^2)
     gyro_bias: Array
     accel_bias: Array
+    # (3, 3), true rate = (1 + matrix) measured rate - bias - force matrix times measured force
     gyro_matrix: Array
+    # gyro_force, accel_matrix: (3, 3), true force = (1 + matrix) measured force - bias
     gyro_force: Array
     accel_matrix: Array
-    arm: Array
-    offset: Array
+    arm: Array  # (3,), from the point that the platform swings about to its sensor, body axes (m)
+    offset: Array  # (3,), of the magnetometer, measured axes (uT)
+    # near, far: (3,), deviation of the field from the declared one, world axes (uT): local and
+    # present, and everywhere
     near: Array
-    matrix: Array
-    lag: float
+    matrix: Array  # (3, 3), of the magnetometer
+    lag: float  # delay of the field samples relative to the inertial samples (s)
     far: Array
-    cov: Array
+    cov: Array  # (61, 61)
 
     def moved(self, step: Array, measured_from_body: Array) -> "Orientation":
         """Return the state moved by a tangent vector; the covariance is constant."""

@@ -4,20 +4,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.stamps import GAP
 from magfusion.estimation.graph.state import ACCEL_BIAS as OWN_ACCEL_BIAS
 from magfusion.estimation.graph.state import GYRO_BIAS as OWN_GYRO_BIAS
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.orientation.filter import OrientationFilter
-from magfusion.estimation.orientation.layout import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
-    TURN,
-    Orientation,
-)
+from magfusion.estimation.orientation.layout import ACCEL_BIAS, GYRO_BIAS, TURN, Orientation
 from magfusion.estimation.orientation.remarks import current_findings, doubts, position_open
 from magfusion.estimation.orientation.stretch import (
-    GAP,
     STEP,
     OrientationStretch,
     corrected_rate,
@@ -36,15 +31,8 @@ TIMING = 0.002  # s; possible delay of the stamps of inertial samples
 class OrientationNavigator:
     """Estimates the orientation at each sample as it arrives.
 
-    Attributes
-    ----------
-    changed : list of float
-        Times of changes of the field that the model did not explain (s).
-
-    Raises
-    ------
-    InputError
-        Where the site has no Earth field.
+    `changed`: times of changes of the field that the model did not explain (s). Raises InputError
+    where the site has no Earth field.
     """
 
     def __init__(self, site: Site) -> None:
@@ -171,10 +159,7 @@ class OrientationNavigator:
 def motion_cov(state: Orientation, attitude: Array, ahead: float, gyro_noise: float) -> Array:
     """Return the covariance of a motion, shape (15, 15), in the layout of `State`.
 
-    Parameters
-    ----------
-    attitude : ndarray, shape (3, 3)
-        world_from_body, propagated by ``ahead`` (s) from the state.
+    `attitude` (3, 3): world_from_body, propagated by ``ahead`` (s) from the state.
     """
     cov = np.zeros((MOTION, MOTION))
     turn = state.cov[TURN, TURN] + gyro_noise**2 * max(ahead, 0.0) * np.eye(3)

@@ -55,14 +55,7 @@ def remarks(
 ) -> tuple[Finding, ...]:
     """Return the findings of a whole log.
 
-    Parameters
-    ----------
-    disturbance : ndarray, shape (states,)
-        (uT)
-    changed : ndarray, shape (m,)
-        (s)
-    earth : ndarray, shape (3,)
-        Declared (uT).
+    `disturbance` (states,) (uT), `changed` (m,) (s). `earth` (3,): declared (uT).
     """
     time, size = np.array([s.time for s in states]), float(np.linalg.norm(earth))
     result = [position_open(), *_attached(states, changed)]

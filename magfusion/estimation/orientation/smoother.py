@@ -22,27 +22,13 @@ PIECE = 1500  # segments whose matrices are in memory at once
 
 @dataclass(frozen=True, eq=False)
 class Oriented:
-    """Orientation of a log.
+    """Orientation of a log."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Of the inertial samples (s).
-    world_from_body : ndarray, shape (n, 3, 3)
-        At each.
-    states : tuple of Orientation
-        At the ends of the segments.
-    disturbance : ndarray, shape (stretches,)
-        Usual deviation of the field then (uT).
-    changed : ndarray, shape (m,)
-        Times of changes of the field that the model did not explain (s).
-    """
-
-    time: Array
-    world_from_body: Array
-    states: tuple[Orientation, ...]
-    disturbance: Array
-    changed: Array
+    time: Array  # (n,), of the inertial samples (s)
+    world_from_body: Array  # (n, 3, 3), at each
+    states: tuple[Orientation, ...]  # at the ends of the segments
+    disturbance: Array  # (stretches,), usual deviation of the field then (uT)
+    changed: Array  # (m,), times of changes of the field that the model did not explain (s)
 
     @property
     def ends(self) -> Array:
@@ -53,10 +39,7 @@ class Oriented:
 def pieces(log: Log, site: Site) -> list[OrientationStretch]:
     """Return the segments of a log, on its clock.
 
-    Raises
-    ------
-    InputError
-        Where it has no samples of the magnetometer, or too few of the IMU.
+    Raises InputError where it has no samples of the magnetometer, or too few of the IMU.
     """
     imu, wave = log.imu, log.waveform
     if wave is None or len(wave) == 0:
@@ -75,14 +58,7 @@ def pieces(log: Log, site: Site) -> list[OrientationStretch]:
 def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet) -> Oriented:
     """Estimate the orientation of a log at every inertial sample.
 
-    Parameters
-    ----------
-    back : bool
-        Whether to use later samples too; otherwise the estimate is that of the online filter.
-
-    Raises
-    ------
-    InputError
+    `back`: whether to use later samples too; otherwise the estimate is that of the online filter.
     """
     cut = pieces(log, site)
     estimator, snapshots, last = OrientationFilter(site), [], None

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.orientation.layout import MICROTESLA, Orientation
+from magfusion.estimation.data_checks.stamps import GAP
+from magfusion.estimation.orientation.layout import Orientation
 from magfusion.model.field import skew
-from magfusion.units import Array, BoolArray
+from magfusion.units import MICROTESLA, Array, BoolArray
 
 STEP = 0.1  # s; of a segment
-GAP = 0.5  # s; a longer pause of the inertial samples interrupts propagation
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,30 +21,15 @@ class OrientationStretch:
 
     A sample is assumed to be the mean over the step that ends at its stamp, as for an instrument
     that averages; one that filters has a larger delay.
-
-    Parameters
-    ----------
-    begin : float
-        (s); NaN after a gap, and at first: the state is not propagated into it.
-    time : ndarray, shape (n,)
-        Of the inertial samples (s).
-    gyro_body, accel_body : ndarray, shape (n, 3)
-        (rad/s, m/s^2)
-    field_time : ndarray, shape (m,)
-        (s)
-    field : ndarray, shape (m, 3)
-        Measured axes (uT).
-    rests : bool
-        Whether the platform is at rest.
     """
 
-    begin: float
-    time: Array
-    gyro_body: Array
-    accel_body: Array
-    field_time: Array
-    field: Array
-    rests: bool
+    begin: float  # (s); NaN after a gap, and at first: the state is not propagated into it
+    time: Array  # (n,), of the inertial samples (s)
+    gyro_body: Array  # (n, 3) (rad/s)
+    accel_body: Array  # (n, 3) (m/s^2)
+    field_time: Array  # (m,) (s)
+    field: Array  # (m, 3), measured axes (uT)
+    rests: bool  # whether the platform is at rest
 
     @cached_property
     def steps(self) -> Array:
@@ -55,30 +40,19 @@ class OrientationStretch:
 
 @dataclass(frozen=True, eq=False)
 class StretchMotion:
-    """Rotation and velocity change of a segment, given the instruments' errors.
+    """Rotation and velocity change of a segment, given the instruments' errors."""
 
-    Parameters
-    ----------
-    attitude : ndarray, shape (n + 1, 3, 3)
-        ``begin_from_then``: at the beginning, and at every sample.
-    by_bias, by_matrix, by_gyro_force : ndarray, shape (3, 3), (3, 9), (3, 9)
-        Derivatives of the whole rotation, axes of the beginning.
-    push : ndarray, shape (3,)
-        Integral of the specific force, axes of the beginning (m/s).
-    by_force, by_accel_matrix : ndarray, shape (3, 3), (3, 9)
-        Its derivatives by the specific force.
-    rate : ndarray, shape (n, 3)
-        Corrected (rad/s).
-    """
-
-    attitude: Array
+    attitude: Array  # (n + 1, 3, 3), ``begin_from_then``: at the beginning, and at every sample
+    # by_bias, by_matrix, by_gyro_force: (3, 3), (3, 9), (3, 9), derivatives of the whole rotation,
+    # axes of the beginning
     by_bias: Array
     by_matrix: Array
     by_gyro_force: Array
-    push: Array
+    push: Array  # (3,), integral of the specific force, axes of the beginning (m/s)
+    # by_force, by_accel_matrix: (3, 3), (3, 9), its derivatives by the specific force
     by_force: Array
     by_accel_matrix: Array
-    rate: Array
+    rate: Array  # (n, 3), corrected (rad/s)
 
 
 def integrate_stretch(stretch: OrientationStretch, state: Orientation) -> StretchMotion:
@@ -117,15 +91,8 @@ def body_from_end(
 ) -> tuple[Array, Array]:
     """Return the mean rotation from the axes of the end to those of the field samples.
 
-    Parameters
-    ----------
-    lag : float
-        Delay of the samples' stamps relative to the motion (s).
-
-    Returns
-    -------
-    mean, by_lag : ndarray, shape (3, 3)
-        Mean of ``sample_from_end``, and its derivative (1/s).
+    `lag`: delay of the samples' stamps relative to the motion (s). Returns `mean`, `by_lag` (3, 3):
+    mean of ``sample_from_end``, and its derivative (1/s).
     """
     shown = stretch.field_time - lag
     stamps = np.concatenate([stretch.time[:1] - stretch.steps[:1], stretch.time])
@@ -147,10 +114,7 @@ def stretches(
 ) -> Iterator[OrientationStretch]:
     """Cut streams into segments; the last one may be shorter.
 
-    Parameters
-    ----------
-    begin : float
-        Time of the sample before the first (s); NaN where there is none.
+    `begin`: time of the sample before the first (s); NaN where there is none.
     """
     first, edge = 0, begin
     while first < len(time):

@@ -20,7 +20,6 @@ from magfusion.model.parameters import Block, Calibration, difference, dimension
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
-AT_ONCE = 2e8  # bytes; variants are solved in groups of this size
 SIDES = 6e7  # bytes of right sides at once; considered parameters are processed in groups
 
 
@@ -29,23 +28,13 @@ class ChainNormalEquations:
     """Normal equations of a chain, accumulated by rows.
 
     The right sides are the step, then the response to one sigma of each considered parameter.
-
-    Parameters
-    ----------
-    diagonal : ndarray, shape (states, 15, 15)
-    following : ndarray, shape (states - 1, 15, 15)
-        Between each state and the next.
-    sides : ndarray, shape (states, 15, 1 + considered + calibration)
-        Right sides, then the border.
-    corner : ndarray, shape (calibration, calibration)
-    right_border : ndarray, shape (calibration, 1 + considered)
     """
 
-    diagonal: Array
-    following: Array
-    sides: Array
-    corner: Array
-    right_border: Array
+    diagonal: Array  # (states, 15, 15)
+    following: Array  # (states - 1, 15, 15), between each state and the next
+    sides: Array  # (states, 15, 1 + considered + calibration), right sides, then the border
+    corner: Array  # (calibration, calibration)
+    right_border: Array  # (calibration, 1 + considered)
 
     @classmethod
     def zeros(cls, states: int, calibration: int, considered: int) -> "ChainNormalEquations":
@@ -78,12 +67,7 @@ class ChainNormalEquations:
     ) -> tuple[Chain, list["ChainNormalEquations"]]:
         """Return empty variants as one chain, and each of them for accumulation.
 
-        Parameters
-        ----------
-        right : int
-            Number of right sides.
-        following : ndarray, shape (states - 1, 15, 15)
-            Common to all.
+        `right`: number of right sides. `following` (states - 1, 15, 15): common to all.
         """
         built = {
             "diagonal": np.zeros((count, states, MOTION, MOTION)),
@@ -104,14 +88,9 @@ class ChainNormalEquations:
     ) -> None:
         """Add rows of some states, each at most once.
 
-        Parameters
-        ----------
-        epoch : int ndarray, shape (m,)
-        own, after : ndarray, shape (m, rows, 15)
-            By the state, and by the next.
-        border : ndarray, shape (m, rows, calibration)
-        right : ndarray, shape (m, rows, k)
-            The first k of 1 + considered; the others are zero.
+        `epoch` (m,). `own`, `after` (m, rows, 15): by the state, and by the next.
+        `border` (m, rows, calibration). `right` (m, rows, k): the first k of 1 + considered; the
+        others are zero.
         """
         back, affected = np.swapaxes(own, 1, 2), right.shape[-1]
         self.diagonal[epoch] += back @ own
@@ -148,20 +127,12 @@ class EpochRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FieldRows:
-    """The rows of a measurement in pieces, since those of a log of hours take much memory.
-
-    Parameters
-    ----------
-    considered : tuple of Block
-        Parameters of the columns.
-    spread : ndarray, shape (dimension, columns)
-        Maps unit noise to a step of the parameters.
-    """
+    """The rows of a measurement in pieces, since those of a log of hours take much memory."""
 
     factors: Factors
     estimate: GraphEstimate
-    considered: tuple[Block, ...]
-    spread: Array
+    considered: tuple[Block, ...]  # parameters of the columns
+    spread: Array  # (dimension, columns), maps unit noise to a step of the parameters
 
     def pieces(self) -> Iterator[EpochRows]:
         """Yield all rows."""
@@ -223,12 +194,8 @@ def block_tridiagonal_system(
 ) -> tuple[ChainNormalEquations, FieldRows | None]:
     """Return the normal equations of all but the fields, and the rows of the fields.
 
-    For a log with one calibration, whose prior is in the graph.
-
-    Parameters
-    ----------
-    columns : slice
-        Of the considered parameters, for the right sides.
+    For a log with one calibration, whose prior is in the graph. `columns`: of the considered
+    parameters, for the right sides.
     """
     assert graph.declared is not None
     spread, by_inertial = np.zeros((0, 0)), None
@@ -250,10 +217,7 @@ def system_with_columns(
 ) -> tuple[ChainNormalEquations, FieldRows | None]:
     """Return the same, with columns of any parameters as right sides.
 
-    Parameters
-    ----------
-    columns : slice
-        Of errors in the calibration's prior from other logs.
+    `columns`: of errors in the calibration's prior from other logs.
     """
     size = dimension(graph.blocks)
     normal = ChainNormalEquations.zeros(graph.epochs, size, extra_columns.number)

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import UNOBSERVABLE, EstimationError
 from magfusion.estimation.graph.graph import Graph, GraphEstimate
+from magfusion.estimation.posterior.separation import OPEN_ROTATION
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import Calibration
 from magfusion.model.trajectory import Trajectory
@@ -13,7 +14,6 @@ from magfusion.units import Array
 
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
 POSITION_CONVERGED = 5e-5  # m; rms change of the positions at which the passes end
-OPEN_ROTATION = 0.3  # rad; beyond, linearisation fails and the sigma itself is not valid
 
 
 def last_move(
@@ -22,13 +22,7 @@ def last_move(
     """Return the rms pose change of the last pass, in sigmas, including an unfinished step.
 
     The gauge of a survey is as uncertain as the survey: a step along it is small in these units.
-
-    Parameters
-    ----------
-    after : Trajectory
-        With a covariance.
-    unfinished : Graph and GraphEstimate, optional
-        State of an unconverged loop of the last pass.
+    `after`: with a covariance. `unfinished`: state of an unconverged loop of the last pass.
     """
     cov, moves = after.pose_cov, [pose_steps(before, after)]
     assert cov is not None

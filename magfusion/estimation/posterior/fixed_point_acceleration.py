@@ -19,15 +19,9 @@ MIN_COUNT = 0.2  # minimum share of a step
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Change by a pass, and the share of it that was applied.
+    """Change by a pass, and the share of it that was applied."""
 
-    Parameters
-    ----------
-    moved : ndarray
-        In units of the convergence limits.
-    """
-
-    moved: Array
+    moved: Array  # in units of the convergence limits
     share: float
 
     @staticmethod

@@ -21,21 +21,11 @@ from magfusion.units import Array, BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class ChannelContribution:
-    """Contribution of the rows of some channels.
+    """Contribution of the rows of some channels."""
 
-    Parameters
-    ----------
-    channels : bool ndarray, shape (channels,)
-        All False for the part of every variant.
-    sums : ChainNormalEquations
-        With only the nonzero right sides.
-    columns : int ndarray
-        Their indices.
-    """
-
-    channels: BoolArray
-    sums: ChainNormalEquations
-    columns: IntArray
+    channels: BoolArray  # (channels,), all False for the part of every variant
+    sums: ChainNormalEquations  # with only the nonzero right sides
+    columns: IntArray  # their indices
 
     def added_to(self, normal: ChainNormalEquations) -> None:
         """Add the part to equations with all right sides, except the diagonal."""
@@ -52,20 +42,11 @@ class ChannelContribution:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The normal equations of a chain in parts.
-
-    Parameters
-    ----------
-    parts : tuple of ChannelContribution
-    following : ndarray
-        As of `ChainNormalEquations`.
-    count : int
-        Number of right sides.
-    """
+    """The normal equations of a chain in parts."""
 
     parts: tuple[ChannelContribution, ...]
-    following: Array
-    count: int
+    following: Array  # as of `ChainNormalEquations`
+    count: int  # number of right sides
 
     def of(self, channels: BoolArray) -> Iterator[ChannelContribution]:
         """Yield the parts of a variant that has some of the channels."""
@@ -104,14 +85,8 @@ def parts_of(
 ) -> Parts:
     """Return a chain in parts, each of which a variant has completely or not at all.
 
-    Parameters
-    ----------
-    rest : ChainNormalEquations
-        Common part of all variants; it is returned without right sides.
-    rows : FieldRows
-        Source of the pieces.
-    kept : bool ndarray, shape (variants, channels)
-        Channels that a variant has.
+    `rest`: common part of all variants; it is returned without right sides. `rows`: source of the
+    pieces. `kept` (variants, channels): channels that a variant has.
     """
     count, states, size = rest.right.shape[-1], len(rest.diagonal), len(rest.corner)
     always = _with_affected_only(rest, kept.shape[1])

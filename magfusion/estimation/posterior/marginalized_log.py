@@ -21,27 +21,15 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class MarginalizedLog:
-    """A quadratic in parameters that several logs share, at its linearisation point.
+    """A quadratic in parameters that several logs share, at its linearisation point."""
 
-    Parameters
-    ----------
-    information : ndarray, shape (s, s)
-        Of the log alone.
-    gradient : ndarray, shape (s,)
-        Descent direction: ``information @ step = gradient`` gives the step of the log alone.
-    by_common : ndarray, shape (s, c)
-        Change by one sigma of each considered parameter that is the same in every log.
-    by_place : ndarray, shape (s, s)
-        Covariance due to errors of the fields that are constant in place.
-    by_log : ndarray, shape (s, s)
-        Covariance due to considered parameters of the log's own.
-    """
-
-    information: Array
+    information: Array  # (s, s), of the log alone
+    # (s,), descent direction: ``information @ step = gradient`` gives the step of the log alone
     gradient: Array
+    # (s, c), change by one sigma of each considered parameter that is the same in every log
     by_common: Array
-    by_place: Array
-    by_log: Array
+    by_place: Array  # (s, s), covariance due to errors of the fields that are constant in place
+    by_log: Array  # (s, s), covariance due to considered parameters of the log's own
 
 
 def columns_of(blocks: tuple[Block, ...], *, own: bool) -> BoolArray:
@@ -62,19 +50,9 @@ def marginalize(
 ) -> MarginalizedLog:
     """Marginalise the graph of a log to its shared parameters.
 
-    Parameters
-    ----------
-    graph : Graph
-        Its prior is omitted except for the log's own parameters.
-    considered : tuple of Block
-        Uncertain parameters that are not estimated.
-    errors : tuple of Block
-        Errors of the beacons' fields that are constant in place.
-
-    Raises
-    ------
-    RuntimeError
-        From GTSAM, for states that the log does not determine.
+    `graph`: its prior is omitted except for the log's own parameters. `considered`: uncertain
+    parameters that are not estimated. `errors`: errors of the beacons' fields that are constant in
+    place. Raises RuntimeError from GTSAM, for states that the log does not determine.
     """
     assert graph.declared is not None
     site, size = graph.declared.site, dimension(graph.blocks)

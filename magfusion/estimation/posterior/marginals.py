@@ -9,23 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.considered import AT_ONCE, responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.posterior.block_tridiagonal_system import (
-    AT_ONCE,
     block_tridiagonal_system,
     column_groups,
 )
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, dimension
 from magfusion.units import Array
 
-POSE = 6
 CHECKED_POSES = 5  # poses at which the tree is used too
 # Of a variance: a thousandth of a sigma.  Minutes without fields round the tree itself to 2e-4.
 AGREED = 2e-3
@@ -33,23 +32,12 @@ AGREED = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class _Marginals:
-    """Covariances from the chain.
+    """Covariances from the chain."""
 
-    Parameters
-    ----------
-    pose_cov : ndarray, shape (n, 6, 6)
-        Of the estimated parameters alone.
-    by_considered : ndarray, shape (n, 6, 6)
-        Contribution of considered parameters.
-    calibration_cov : ndarray, shape (dimension, dimension)
-        Of the estimated parameters alone.
-    response : ndarray, shape (dimension, considered)
-    """
-
-    pose_cov: Array
-    by_considered: Array
-    calibration_cov: Array
-    response: Array
+    pose_cov: Array  # (n, 6, 6), of the estimated parameters alone
+    by_considered: Array  # (n, 6, 6), contribution of considered parameters
+    calibration_cov: Array  # (dimension, dimension), of the estimated parameters alone
+    response: Array  # (dimension, considered)
 
     @property
     def whole(self) -> tuple[Array, Array, Array]:
@@ -63,20 +51,11 @@ def marginals(
 ) -> tuple[Array, Array, Array]:
     """Return the posterior covariance of every pose and of the calibration.
 
-    Parameters
-    ----------
-    considered : tuple of Block
-        Uncertain parameters that were not estimated: the effect of their errors on the estimate is
-        added (a consider covariance).
-
-    Returns
-    -------
-    pose_cov : ndarray, shape (n, 6, 6)
-        Calibration marginalised, its gauge included.
-    calibration_cov : ndarray, shape (dimension, dimension)
-    calibration_response : ndarray, shape (dimension, considered)
-        Change of the calibration by one sigma of each considered parameter, included in its
-        covariance.
+    `considered`: uncertain parameters that were not estimated: the effect of their errors on the
+    estimate is added (a consider covariance). Returns `pose_cov` (n, 6, 6): calibration
+    marginalised, its gauge included; `calibration_cov` (dimension, dimension);
+    `calibration_response` (dimension, considered): change of the calibration by one sigma of each
+    considered parameter, included in its covariance.
     """
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)

@@ -21,20 +21,12 @@ NativePiece = tuple[IntArray, Array, Array | None, Array, Array]
 
 
 class Columns(NamedTuple):
-    """Columns of parameters that are not estimated.
-
-    Parameters
-    ----------
-    blocks : tuple of Block
-    spread : ndarray, shape (dimension, columns)
-        Maps each column to a step of the parameters.
-    inertial : callable, optional
-        Returns for some intervals (int ndarray) the columns of the whitened error of their
-        inertial factors, shape (m, 15, columns).
-    """
+    """Columns of parameters that are not estimated."""
 
     blocks: tuple[Block, ...]
-    spread: Array
+    spread: Array  # (dimension, columns), maps each column to a step of the parameters
+    # returns for some intervals (int ndarray) the columns of the whitened error of their inertial
+    # factors, shape (m, 15, columns)
     inertial: Callable[[IntArray], Array] | None = None
 
     @property
@@ -56,13 +48,7 @@ class _Kind:
 
 @dataclass(eq=False)
 class NativeRows:
-    """The rows at an estimate, linearised once for any columns.
-
-    Parameters
-    ----------
-    graph : Graph
-    estimate : GraphEstimate
-    """
+    """The rows at an estimate, linearised once for any columns."""
 
     graph: Graph
     estimate: GraphEstimate
@@ -93,12 +79,8 @@ class NativeRows:
     def of(self, columns: Columns, begin: int = 0, end: int | None = None) -> Iterator[NativePiece]:
         """Yield the rows of factors by their first states, in the form of `Normal.add`.
 
-        Those without a nonzero column have only the first of the right sides.
-
-        Parameters
-        ----------
-        begin, end : int
-            Of the states; all by default.
+        Those without a nonzero column have only the first of the right sides. `begin`, `end`: of
+        the states; all by default.
         """
         for _, rows in self.kinds_of(columns, begin, end):
             yield rows

@@ -42,19 +42,11 @@ MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 
 @dataclass(frozen=True)
 class Tuned:
-    """One standard deviation of the noise, declared and estimated.
+    """One standard deviation of the noise, declared and estimated."""
 
-    Parameters
-    ----------
-    owner : str
-        Beacon, "imu" or "motion_prior".
-    key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise', or of `OF_MOTION`}
-    declared, estimated : float
-        In the unit of the site's file.
-    """
-
-    owner: str
-    key: str
+    owner: str  # beacon, "imu" or "motion_prior"
+    key: str  # noise_factor, model_error, gyro_noise, accel_noise, or of `OF_MOTION`
+    # declared, estimated: in the unit of the site's file
     declared: float
     estimated: float
 
@@ -184,10 +176,7 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
 def _tuned_imu(system: ResidualProjection, now: Site, declared: Site, smooth: float) -> list[Tuned]:
     """Return the densities of gyro and accelerometer.
 
-    Parameters
-    ----------
-    smooth : float
-        Share of the model error's variance that is smooth.
+    `smooth`: share of the model error's variance that is smooth.
     """
     plain = system.inertial()
     result = []

@@ -29,11 +29,7 @@ AT_ONCE = 256  # states whose pairs are computed together
 def unmonitored(prior: Array, monitored: int = 1) -> Array:
     """Return the probability that more than one beacon, or two, are faulty, shape (n,).
 
-    Parameters
-    ----------
-    prior : ndarray, shape (n, beacons)
-    monitored : int
-        Number of faulty beacons that are monitored: 1 or 2.
+    `prior` (n, beacons). `monitored`: number of faulty beacons that are monitored: 1 or 2.
     """
     none = np.prod(1.0 - prior, axis=1)
     odds = prior / np.maximum(1.0 - prior, np.finfo(np.float64).tiny)
@@ -43,20 +39,11 @@ def unmonitored(prior: Array, monitored: int = 1) -> Array:
 
 
 class FaultModes(NamedTuple):
-    """Hypotheses of faulty beacons at each state.
+    """Hypotheses of faulty beacons at each state."""
 
-    Parameters
-    ----------
-    sigma : Radius, shape (n, modes, 2)
-        Of the estimates without their beacons.
-    threshold : ndarray, shape (n, modes, 2)
-        Largest deviation from these estimates (rad, m).
-    prior : ndarray, shape (n, modes)
-    """
-
-    sigma: Radius
-    threshold: Array
-    prior: Array
+    sigma: Radius  # (n, modes, 2), of the estimates without their beacons
+    threshold: Array  # (n, modes, 2), largest deviation from these estimates (rad, m)
+    prior: Array  # (n, modes)
 
     def __or__(self, other: "FaultModes") -> "FaultModes":
         sigma = zip(self.sigma, other.sigma, strict=True)
@@ -115,14 +102,9 @@ def protection_levels(
     """Return the protection levels of position (m) and attitude (deg), each of shape (n,).
 
     Each has half of the risk.  NaN where there is none: the pose is not determined without some
-    beacon that may be faulty, or without two that are faulty too often.
-
-    Parameters
-    ----------
-    slack : float
-        As of `Separation.thresholds`.
-    prior : ndarray, shape (n, beacons), optional
-        Probability that each beacon is faulty, where more is known than `Risk.fault`.
+    beacon that may be faulty, or without two that are faulty too often. `slack`: as of
+    `Separation.thresholds`. `prior` (n, beacons): probability that each beacon is faulty, where
+    more is known than `Risk.fault`.
     """
     prior = separation.prior(risk) if prior is None else prior
     modes = FaultModes(separation.subset_sigma, separation.thresholds(risk, slack), prior)
@@ -207,15 +189,9 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
 def with_rivals(level: Array, distance: Array, weight: Array, share: float) -> Array:
     """Return levels extended to every rival pose that is too probable to be ignored.
 
-    Parameters
-    ----------
-    level : ndarray, shape (n,)
-    distance : ndarray, shape (n, rivals)
-        Of each rival hypothesis from the best.
-    weight : ndarray, shape (n, rivals)
-        Posterior share, falling.
-    share : float
-        Maximum total share of the rivals in the risk.
+    `level` (n,). `distance` (n, rivals): of each rival hypothesis from the best.
+    `weight` (n, rivals): posterior share, falling. `share`: maximum total share of the rivals in
+    the risk.
     """
     rest = np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
     reach = np.where(rest > share, distance + level[:, None], level[:, None])

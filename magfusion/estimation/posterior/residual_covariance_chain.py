@@ -49,19 +49,10 @@ def left_by_chain(
 ) -> tuple[Array, Array] | None:
     """Return the residuals, then the remainders of other errors; None if dominated by rounding.
 
-    Parameters
-    ----------
-    considered : tuple of Block
-        Parameters that are estimated here with a prior of their own.
-    fields : sequence of ndarray, shape (n, channels, 6)
-        Errors of the phasors, whitened and weighted.
-    inertial : sequence of ndarray, shape (intervals, 15)
-        The corresponding errors of the inertial factors, whitened.
-
-    Returns
-    -------
-    ndarray, shape (1 + errors, n, channels, 6)
-    ndarray, shape (1 + errors, intervals, 15)
+    `considered`: parameters that are estimated here with a prior of their own.
+    `fields` (n, channels, 6) each: errors of the phasors, whitened and weighted.
+    `inertial` (intervals, 15) each: the corresponding errors of the inertial factors, whitened.
+    Returns (1 + errors, n, channels, 6); (1 + errors, intervals, 15).
     """
     columns = _fixed_columns(graph, considered)
     normal = _with_priors(graph, estimate, columns.number, len(fields))

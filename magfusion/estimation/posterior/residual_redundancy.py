@@ -29,28 +29,16 @@ ORDINARY = 3.0  # of usual sigmas; an interval with larger ones has a gap
 
 @dataclass(frozen=True, eq=False)
 class ChannelErrors:
-    """Whitened errors of one channel, in world axes, at the epochs that have it.
+    """Whitened errors of one channel, in world axes, at the epochs that have it."""
 
-    Parameters
-    ----------
-    epoch : int ndarray, shape (m,)
-        Rows of the samples.
-    seen : ndarray, shape (m, 6)
-        Residuals.
-    residuals : tuple of ndarray, shape (m, 6 * draws)
-        Remainders of drawn noise, of a rough and of a smooth drawn model error, and of drawn
-        inertial noise.
-    variance : tuple of ndarray, shape (m,)
-        Of noise and of model error of size one: the sum over the components.
-    size : tuple of float
-        Noise and model error of the drawn errors.
-    """
-
-    epoch: IntArray
-    seen: Array
+    epoch: IntArray  # (m,), rows of the samples
+    seen: Array  # (m, 6), residuals
+    # (m, 6 * draws) each, remainders of drawn noise, of a rough and of a smooth drawn model error,
+    # and of drawn inertial noise
     residuals: tuple[Array, Array, Array, Array]
+    # (m,) each, of noise and of model error of size one: the sum over the components
     variance: tuple[Array, Array]
-    size: tuple[float, float]
+    size: tuple[float, float]  # noise and model error of the drawn errors
 
 
 class ResidualProjection:
@@ -251,12 +239,7 @@ def _matrices(rng: np.random.Generator, place: Array, count: int, *, smooth: boo
 
     Their correlation is exp(-distance), or exp(-distance^2 / 2) where they are smooth; by waves of
     random vectors (random Fourier features), Cauchy's for the one and Gauss's for the other.
-
-    Parameters
-    ----------
-    place : ndarray, shape (n, magnetometers, 3)
-    count : int
-    smooth : bool
+    `place` (n, magnetometers, 3).
     """
     wave = rng.standard_normal((WAVES, 3))
     if not smooth:

@@ -24,13 +24,9 @@ STRETCH = 128  # states that are eliminated at once
 def left_over(graph: Graph, estimate: GraphEstimate, columns: Columns, native: NativeRows) -> Array:
     """Return the normal equations of fixed parameters after elimination of all estimates.
 
-    For a log with one calibration, whose prior is in the graph.
-
-    Returns
-    -------
-    ndarray, shape (1 + columns, 1 + columns)
-        Products of the projected residual and columns, the latter with the sign of a right side:
-        the descent gradient of the columns is minus their products with the residual.
+    For a log with one calibration, whose prior is in the graph. Returns (1 + columns, 1 + columns):
+    products of the projected residual and columns, the latter with the sign of a right side: the
+    descent gradient of the columns is minus their products with the residual.
     """
     count, propagated = 1 + columns.number, None
     states, whole = (

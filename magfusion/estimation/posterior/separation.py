@@ -26,6 +26,8 @@ ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
 SINGLE_FAULT_TAIL = 0.215  # probability of a tail below which a single number bounds it
 OPEN_POSITION = 10.0  # m; norm of the sigmas beyond which a position is not determined
+OPEN_ROTATION = 0.3  # rad; beyond, linearisation fails and the sigma itself is not valid
+SLACK = 3.0  # sigma; smaller steps are covered, and no alarm
 MIN_COUNT = 1e-30  # rad, m; a deviation below it is zero
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
 ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
@@ -34,18 +36,10 @@ UNIT = np.eye(3)
 
 
 class Radius(NamedTuple):
-    """Norms of Gaussian vectors of three numbers, bounded from above.
+    """Norms of Gaussian vectors of three numbers, bounded from above."""
 
-    Parameters
-    ----------
-    whole : ndarray, shape (...)
-        Root of the sum of the variances.
-    largest : ndarray, shape (...)
-        Largest standard deviation of any direction.
-    """
-
-    whole: Array
-    largest: Array
+    whole: Array  # (...), root of the sum of the variances
+    largest: Array  # (...), largest standard deviation of any direction
 
     def tail(self, radius: Array) -> Array:
         """Return an upper bound of the probability that a norm exceeds a radius."""
@@ -90,31 +84,17 @@ class Separation:
     """Estimates without each beacon, relative to the one with all.
 
     Rotation, then position, in axes of any kind.
-
-    Parameters
-    ----------
-    step : ndarray, shape (n, beacons, 6)
-        Estimate without a beacon minus the one with all (rad, m).
-    cov : ndarray, shape (n, 6, 6)
-        Of the estimate with all.
-    subset_cov : ndarray, shape (n, beacons, 6, 6)
-        Without a beacon; not valid where the pose is not determined.
-    separation_cov : ndarray, shape (n, beacons, 6, 6)
-        Of the step.
-    determined : bool ndarray, shape (n, beacons)
-        Whether there is an estimate without a beacon.
-    cost : ndarray, shape (n, beacons)
-        Squared residual without a beacon.
-    rows : ndarray, shape (n, beacons)
-        Number of residuals of each beacon; zero where it is missing, and cannot be faulty.
     """
 
-    step: Array
-    cov: Array
+    step: Array  # (n, beacons, 6), estimate without a beacon minus the one with all (rad, m)
+    cov: Array  # (n, 6, 6), of the estimate with all
+    # (n, beacons, 6, 6), without a beacon; not valid where the pose is not determined
     subset_cov: Array
-    separation_cov: Array
-    determined: BoolArray
-    cost: Array
+    separation_cov: Array  # (n, beacons, 6, 6), of the step
+    determined: BoolArray  # (n, beacons), whether there is an estimate without a beacon
+    cost: Array  # (n, beacons), squared residual without a beacon
+    # (n, beacons), number of residuals of each beacon; zero where it is missing, and cannot be
+    # faulty
     rows: Array
 
     def __or__(self, other: "Separation") -> "Separation":
@@ -160,10 +140,8 @@ class Separation:
     def thresholds(self, risk: Risk, slack: float = 0.0) -> Array:
         """Return the largest step without an alarm, shape (n, beacons, 2) (rad, m).
 
-        Parameters
-        ----------
-        slack : float
-            A step below this number of sigmas of the estimate with all is no alarm: it is covered.
+        `slack`: a step below this number of sigmas of the estimate with all is no alarm: it is
+        covered.
         """
         tests = len(PARTS) * self.step.shape[1]
         limit = self.separation_sigma.beyond(risk.false_alarm / tests)
@@ -181,9 +159,7 @@ class Separation:
     def likely(self, prior: Array) -> Array:
         """Return the probability of each beacon, given that one is faulty, shape (n, beacons).
 
-        Parameters
-        ----------
-        prior : ndarray, shape (n, beacons)
+        `prior` (n, beacons).
         """
         # Omitting more rows explains more; each number is worth two (Akaike).
         cost = np.where(self.determined & (prior > 0.0), self.cost + 2.0 * self.rows, np.inf)
@@ -229,11 +205,7 @@ def linear_separation(
 def spread(gain: Array, covariance: Array | None) -> Array:
     """Return the covariance of a linear estimate, shape (n, k, k).
 
-    Parameters
-    ----------
-    gain : ndarray, shape (n, k, rows)
-    covariance : ndarray, shape (n, rows, rows), optional
-        The identity by default.
+    `gain` (n, k, rows). `covariance` (n, rows, rows): the identity by default.
     """
     propagated = gain if covariance is None else gain @ covariance
     return propagated @ np.swapaxes(gain, -1, -2)

@@ -45,10 +45,7 @@ def covered_beacons(tuned: Sequence[Tuned], fields: FieldSamples, site: Site) ->
 def tuned_noise(tuned: Sequence[Tuned], covered: Container[str] = ()) -> Iterator[Finding]:
     """Yield the findings of estimated noise: more than declared makes a result doubtful.
 
-    Parameters
-    ----------
-    covered : container of str
-        Beacons whose declared model error covers their noise.
+    `covered`: beacons whose declared model error covers their noise.
     """
     more = [
         t

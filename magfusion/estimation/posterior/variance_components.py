@@ -31,45 +31,24 @@ KINDS = (slice(0, 1), slice(1, 3))
 
 
 class BeaconParts(NamedTuple):
-    """Most probable components of one beacon's residuals.
+    """Most probable components of one beacon's residuals."""
 
-    Parameters
-    ----------
-    sizes : tuple of float
-        Noise factor and model error as declared.
-    white : float
-        Factor of the declared noise, by all white parts.
-    model : float, optional
-        Factor of the declared model error; None where it was not estimated.
-    smooth : float
-        Share of its variance that is smooth.
-    accepted_factor : float
-        Ratio of the factor estimated from errors drawn with the estimated sizes to the true one.
-    """
-
-    sizes: tuple[float, float]
-    white: float
+    sizes: tuple[float, float]  # noise factor and model error as declared
+    white: float  # factor of the declared noise, by all white parts
+    # factor of the declared model error; None where it was not estimated
     model: float | None = None
-    smooth: float = 0.0
+    smooth: float = 0.0  # share of its variance that is smooth
+    # ratio of the factor estimated from errors drawn with the estimated sizes to the true one
     accepted_factor: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class BeaconErrors:
-    """Errors of all channels of one beacon.
-
-    Parameters
-    ----------
-    channels : list of ChannelErrors
-    sizes : tuple of float
-        Noise factor and model error as declared.
-    bent : bool
-        Whether a model error is estimated.
-    """
+    """Errors of all channels of one beacon."""
 
     channels: list[ChannelErrors]
-    sizes: tuple[float, float]
-    bent: bool
+    sizes: tuple[float, float]  # noise factor and model error as declared
+    bent: bool  # whether a model error is estimated
 
 
 def parts_of(
@@ -77,12 +56,8 @@ def parts_of(
 ) -> list[BeaconParts | None]:
     """Return the components of each beacon's residuals; None where there are too few.
 
-    Parameters
-    ----------
-    shared_by : ndarray, shape (n,)
-        Number of epochs with the same model error.
-    lag : int
-        Number of epochs that share samples.
+    `shared_by` (n,): number of epochs with the same model error. `lag`: number of epochs that share
+    samples.
     """
     fitted = _fitted(beacons, shared_by, lag)
     bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
@@ -142,11 +117,7 @@ def _fitted_same_parts(
 ) -> list[tuple[Array, float]]:
     """Return the result of `_fitted` for beacons that have the same parts.
 
-    Parameters
-    ----------
-    scaled : list of tuple
-        From `by_scale`, one per beacon.
-    sizes : ndarray, shape (k, 2)
+    `scaled`: from `by_scale`, one per beacon. `sizes` (k, 2).
     """
     maximum = max(len(square) for square, _, _ in scaled)
     square, near = np.zeros((len(scaled), maximum)), np.ones((len(scaled), maximum))
@@ -189,16 +160,10 @@ def by_scale(
 
     Noise is equal on all scales; an error that is constant in place is mostly in the longest.  Its
     share in the shorter ones depends on its smoothness, which is not declared: they measure its
-    size only if the smoothness is estimated, too.
-
-    Returns
-    -------
-    square : ndarray, shape (m,)
-    expected : ndarray, shape (5, m)
-        Of a component, by noise, by a rough and by a smooth model error of size one, by a relative
-        error of size one that is white, and by inertial noise.
-    near : ndarray, shape (m,)
-        Share that is independent, where model error prevails.
+    size only if the smoothness is estimated, too. Returns `square` (m,); `expected` (5, m): of a
+    component, by noise, by a rough and by a smooth model error of size one, by a relative error of
+    size one that is white, and by inertial noise; `near` (m,): share that is independent, where
+    model error prevails.
     """
     every, seen, parts, near = _haar(SCALES), [], [], []
     for own in channels:
@@ -220,17 +185,10 @@ def by_scale(
 def _expected(residual: Array, given: Array, size: tuple[float, float], draws: int) -> Array:
     """Return the expected square of a component by each kind of error, (5, scales, blocks).
 
-    The share of an error in a scale depends on the motion: it is determined for each stretch of
-    as few blocks as the number of draws allows.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (4, scales, blocks)
-        Squares of the remainders of drawn errors, mean of the draws.
-    given : ndarray, shape (2, blocks)
-        Variance by noise and by a model error of size one.
-    size : tuple of float
-        Of the drawn noise and model error.
+    The share of an error in a scale depends on the motion: it is determined for each stretch of as
+    few blocks as the number of draws allows. `residual` (4, scales, blocks): squares of the
+    remainders of drawn errors, mean of the draws. `given` (2, blocks): variance by noise and by a
+    model error of size one. `size`: of the drawn noise and model error.
     """
     if residual.shape[2] == 0:
         return np.zeros((5, SCALES, 0))

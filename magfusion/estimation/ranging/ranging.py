@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging_data import POSE, RangingWindows
+from magfusion.estimation.posterior.separation import POSE
+from magfusion.estimation.ranging.ranging_data import RangingWindows
 from magfusion.estimation.ranging.ranging_model import RangingModel
 from magfusion.estimation.ranging.ranging_starts import starts
 from magfusion.estimation.solve.batched import (
@@ -25,38 +26,19 @@ KEPT = 24  # starts that are refined
 
 @dataclass(frozen=True, eq=False)
 class Ranged:
-    """The sensor's pose relative to the magnet, of the most probable start and of its rivals.
+    """The sensor's pose relative to the magnet, of the most probable start and of its rivals."""
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (3, 3)
-        Attitude of the high side's frame in that of the rotor.
-    position_world : ndarray, shape (3,)
-        Of the sensor when both are at the windows' depth origins (m).
-    names : tuple of str
-        Of the parameters estimated with the pose.
-    values, prior_sigma : ndarray, shape (names,)
-    cov : ndarray, shape (6 + names, 6 + names)
-        Rotation and translation in the axes of the high side's frame (rad, m), then the names.
-    chi_square : float
-        Without priors.
-    freedom : int
-    rival_chi_square : float
-        Of the second-best separate minimum; infinite where there is none.
-    conditioning : float
-        Smallest over largest singular value of the whitened Jacobian by pose, with unit columns.
-    converged : bool
-    """
-
-    world_from_body: Array
-    position_world: Array
-    names: tuple[str, ...]
-    values: Array
-    prior_sigma: Array
+    world_from_body: Array  # (3, 3), attitude of the high side's frame in that of the rotor
+    position_world: Array  # (3,), of the sensor when both are at the windows' depth origins (m)
+    names: tuple[str, ...]  # of the parameters estimated with the pose
+    values: Array  # (names,)
+    prior_sigma: Array  # (names,)
+    # (6 + names, 6 + names), rotation and translation in the axes of the high side's frame
+    # (rad, m), then the names
     cov: Array
-    chi_square: float
+    chi_square: float  # without priors
     freedom: int
-    rival_chi_square: float
+    rival_chi_square: float  # of the second-best separate minimum; infinite where there is none
     residual: Array
     converged: bool
 
@@ -76,10 +58,7 @@ def _moved(state: Array, step: Array) -> Array:
 def find_range(site: Site, windows: RangingWindows) -> Ranged:
     """Return the pose of the sensor relative to the magnet.
 
-    Parameters
-    ----------
-    site : Site
-        Its only beacon is a rotor.
+    `site`: its only beacon is a rotor.
     """
     every = max(len(windows.fields) // THINNED, 1)
     thin = RangingModel(site, windows.rows(slice(every // 2, None, every)))

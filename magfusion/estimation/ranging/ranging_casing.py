@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
+from magfusion.estimation.posterior.separation import POSE
+from magfusion.estimation.ranging.ranging_data import FIRST, RangingWindows
 from magfusion.model.field import observe
 from magfusion.model.physics.casing import (
     MAX_LOG_ERROR,
@@ -78,10 +79,8 @@ class CasingModel:
     ) -> CasingResponse:
         """Return the field of a casing's poles along it, outside its wall.
 
-        Parameters
-        ----------
-        attitude, position : ndarray, shape (k, n, 1, 3, 3) and (k, n, 1, 3)
-            Of the sensor in the middle of windows.
+        `attitude`, `position` (k, n, 1, 3, 3) and (k, n, 1, 3): of the sensor in the middle of
+        windows.
         """
         factor = np.exp(
             np.clip(extra["log_gather"], -MAX_LOG_ERROR, MAX_LOG_ERROR) + 1j * extra["phase_gather"]

@@ -10,41 +10,24 @@ from magfusion.units import Array
 # Gauss-Legendre points of a window, relative to its middle and length, for the motion within it.
 WITHIN, SHARE = np.sqrt(0.6) * np.array([-0.5, 0.0, 0.5]), np.array([5.0, 8.0, 5.0]) / 18.0
 FIRST = np.array([1.0, 0.0, 0.0])  # axis of the sensor's body, down its hole
-POSE = 6
 SAME_PLACE_M = 1.0  # m; places of the sensor that are closer count as one
 
 
 @dataclass(frozen=True, eq=False)
 class RangingWindows:
-    """Measurements while a magnet passes.
+    """Measurements while a magnet passes."""
 
-    Parameters
-    ----------
-    fields : FieldSamples
-        Of one rotor, by its angle.
-    angle_known : bool
-        Whether the angle was measured; otherwise each window has a phase of its own.
-    magnet : ndarray, shape (n, 3)
-        Depth of the magnet at the points `WITHIN` each window (m), from ``magnet_from``.
-    sensor : ndarray, shape (n,)
-        Depth of the sensor (m), from ``sensor_from``.
-    roll : ndarray, shape (n,)
-        Of the sensor about its hole, from its high side (rad).
-    depth_sigma : float
-        Of a window's depth, independently (m).
-    depth_scale_sigma : float
-        Of all, relative.
-    """
-
-    fields: FieldSamples
+    fields: FieldSamples  # of one rotor, by its angle
+    # whether the angle was measured; otherwise each window has a phase of its own
     angle_known: bool
+    # (n, 3), depth of the magnet at the points `WITHIN` each window (m), from ``magnet_from``
     magnet: Array
-    sensor: Array
-    roll: Array
+    sensor: Array  # (n,), depth of the sensor (m), from ``sensor_from``
+    roll: Array  # (n,), of the sensor about its hole, from its high side (rad)
     magnet_from: float
     sensor_from: float
-    depth_sigma: float = 0.0
-    depth_scale_sigma: float = 1e-3
+    depth_sigma: float = 0.0  # of a window's depth, independently (m)
+    depth_scale_sigma: float = 1e-3  # of all, relative
 
     def rows(self, kept: slice) -> "RangingWindows":
         """Return some windows."""

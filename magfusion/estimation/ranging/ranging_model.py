@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.ranging.ranging_casing import CasingModel, CasingResponse, casing_unknowns
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, SHARE, RangingWindows
+from magfusion.estimation.ranging.ranging_data import FIRST, SHARE, RangingWindows
 from magfusion.estimation.ranging.ranging_noise import (
     WindowPrediction,
     real_and_imaginary,
@@ -41,10 +42,7 @@ class _Unknown(NamedTuple):
 class RangingModel:
     """Residuals of windows and their derivatives; one problem per start.
 
-    Parameters
-    ----------
-    about : ndarray, shape (12 + unknowns,), optional
-        State at which errors of depths and of the model are weighted.
+    `about` (12 + unknowns,): state at which errors of depths and of the model are weighted.
     """
 
     def __init__(self, site: Site, windows: RangingWindows, about: Array | None = None) -> None:

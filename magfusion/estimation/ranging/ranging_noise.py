@@ -19,18 +19,12 @@ GATHERED_ERROR = 0.01
 
 @dataclass(frozen=True, eq=False)
 class WindowPrediction:
-    """Predicted phasors of windows, and their slope along the magnet's path.
+    """Predicted phasors of windows, and their slope along the magnet's path."""
 
-    Parameters
-    ----------
-    phasor, slope : complex ndarray, shape (n, tones, 3)
-        (T) and (T/m).
-    gathered : ndarray, shape (n, tones)
-        Share of the field in proportion to the strength of a casing's poles.
-    """
-
+    # phasor, slope: (n, tones, 3) (T), and (T/m)
     phasor: ComplexArray
     slope: ComplexArray
+    # (n, tones), share of the field in proportion to the strength of a casing's poles
     gathered: Array
 
 
@@ -51,15 +45,8 @@ def window_weight(site: Site, windows: RangingWindows) -> Array:
 def whitening(site: Site, windows: RangingWindows, course: WindowPrediction | None = None) -> Array:
     """Return the inverse root of the covariance of all parts of all windows.
 
-    Parameters
-    ----------
-    course : WindowPrediction, optional
-        Linearisation point; by default the slope is bounded by the measurements, equal in all axes.
-
-    Returns
-    -------
-    ndarray, shape (m, m)
-        ``m`` is windows by tones by `real_and_imaginary`.
+    `course`: linearisation point; by default the slope is bounded by the measurements, equal in all
+    axes. Returns (m, m): ``m`` is windows by tones by `real_and_imaginary`.
     """
     fields, valid = windows.fields, windows.fields.valid
     n, tones = valid.shape

@@ -20,51 +20,28 @@ PAUSE = 2.0  # s; without samples, after which angle tracking restarts
 
 @dataclass(frozen=True, eq=False)
 class DepthErrors:
-    """Errors of depths.
+    """Errors of depths."""
 
-    Parameters
-    ----------
-    sigma : float
-        Of the depth of a window (m).
-    scale_sigma : float
-        Of all, relative: stretch of the string.
-    """
-
-    sigma: float = 0.01
-    scale_sigma: float = 1e-3
+    sigma: float = 0.01  # of the depth of a window (m)
+    scale_sigma: float = 1e-3  # of all, relative: stretch of the string
 
 
 @dataclass(frozen=True, eq=False)
 class RangingLog:
-    """Ranging data of a log.
-
-    Parameters
-    ----------
-    windows : RangingWindows
-    speed_hz : ndarray, shape (n,)
-        Rotation rate of the magnet in each window.
-    high_side : bool
-        Whether gravity determines it; otherwise directions are from the sensor's own third axis.
-    inclination : float, optional
-        Of the sensor's hole from the vertical, downwards (rad).
-    dropped : int
-        Windows that could not be demodulated.
-    """
+    """Ranging data of a log."""
 
     windows: RangingWindows
-    speed_hz: Array
+    speed_hz: Array  # (n,), rotation rate of the magnet in each window
+    # whether gravity determines it; otherwise directions are from the sensor's own third axis
     high_side: bool
-    inclination: float | None
-    dropped: int
+    inclination: float | None  # of the sensor's hole from the vertical, downwards (rad)
+    dropped: int  # windows that could not be demodulated
 
 
 def the_rotor(site: Site) -> Beacon:
     """Return the only beacon of a site for ranging.
 
-    Raises
-    ------
-    InputError
-        Where there is another beacon, or the only one is no magnet on a shaft.
+    Raises InputError where there is another beacon, or the only one is no magnet on a shaft.
     """
     if len(site.beacons) != 1 or site.beacons[0].rotor is None:
         raise InputError("beacons: ranging needs exactly one beacon with rotor; declare it")
@@ -72,19 +49,13 @@ def the_rotor(site: Site) -> Beacon:
 
 
 def ranging_log(
-    log: Log,
-    site: Site,
-    window: float,
-    mains_hz: float = 50.0,
-    errors: DepthErrors = DepthErrors(),
+    log: Log, site: Site, window: float, mains_hz: float = 50.0, errors: DepthErrors = DepthErrors()
 ) -> RangingLog:
     """Return the windows of a log.
 
-    Raises
-    ------
-    InputError
-        Where it lacks the waveform or the depths of the magnet, an angle names another beacon, the
-        magnet cannot be distinguished from noise, or too few windows can be demodulated.
+    Raises InputError where it lacks the waveform or the depths of the magnet, an angle names
+    another beacon, the magnet cannot be distinguished from noise, or too few windows can be
+    demodulated.
     """
     beacon = the_rotor(site)
     if log.waveform is None:
@@ -161,9 +132,7 @@ def _followed(log: Log, beacon: Beacon) -> Array:
     parts = []
     for rows in np.split(np.arange(len(waveform)), cuts):
         own = replace(
-            waveform,
-            time=waveform.time[rows],
-            measured_sensor=waveform.measured_sensor[rows],
+            waveform, time=waveform.time[rows], measured_sensor=waveform.measured_sensor[rows]
         )
         parts.append(followed_angle(own, beacon.frequency_hz, rotor))
     return np.concatenate(parts)

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.ranging.ranging import Ranged
-from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
+from magfusion.estimation.ranging.ranging_data import FIRST, RangingWindows
 from magfusion.model.field import skew
 from magfusion.units import Array
 
@@ -14,38 +15,27 @@ LATERAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # to the right and to t
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Position of the magnet relative to the sensor at some depths of both.
+    """Position of the magnet relative to the sensor at some depths of both."""
 
-    Parameters
-    ----------
-    place : ndarray, shape (n, 3)
-        Ahead (down the sensor's hole), to the right looking down it, and up to its high side (m).
-    cov : ndarray, shape (n, 3, 3)
-        (m^2)
-    """
-
+    # (n, 3), ahead (down the sensor's hole), to the right looking down it, and up to its high side
+    # (m)
     place: Array
-    cov: Array
+    cov: Array  # (n, 3, 3) (m^2)
 
 
 @dataclass(frozen=True)
 class WellPair:
-    """The two wells at the depth of the sensor.
+    """The two wells at the depth of the sensor."""
 
-    Parameters
-    ----------
-    distance, distance_sigma : float
-        From the sensor to the line of the magnet's path, centre to centre (m).
-    direction, direction_sigma : float
-        Of its nearest point from the high side, clockwise looking down the hole (rad).
-    depth, depth_sigma : float
-        Measured depth of the magnet where it is nearest (m).
-    """
-
+    # distance, distance_sigma: from the sensor to the line of the magnet's path, centre to centre
+    # (m)
     distance: float
     distance_sigma: float
+    # direction, direction_sigma: of its nearest point from the high side, clockwise looking down
+    # the hole (rad)
     direction: float
     direction_sigma: float
+    # depth, depth_sigma: measured depth of the magnet where it is nearest (m)
     depth: float
     depth_sigma: float
 
@@ -63,12 +53,8 @@ class Divergence:
 class Wells:
     """Relative position of two wells from a range.
 
-    Parameters
-    ----------
-    axis : ndarray, shape (3,)
-        Of the magnet, along its path.
-    excess : float
-        Factor by which the covariance is too small.
+    `axis` (3,): of the magnet, along its path. `excess`: factor by which the covariance is too
+    small.
     """
 
     def __init__(

@@ -34,37 +34,21 @@ HIGHEST = 0.45  # of the sampling rate; maximum frequency of the probes
 
 @dataclass(frozen=True, eq=False)
 class AlignedReference:
-    """Samples of a reference sensor at the sample times of a rest.
+    """Samples of a reference sensor at the sample times of a rest."""
 
-    Parameters
-    ----------
-    measured : ndarray, shape (n, 3)
-        (T)
-    there : bool ndarray, shape (n,)
-    """
-
-    measured: Array
-    there: BoolArray
+    measured: Array  # (n, 3) (T)
+    there: BoolArray  # (n,)
     lag: Lag
     clock: ReferenceClock = field(default_factory=ReferenceClock)
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceHistory:
-    """Results of earlier segments of a stream for a reference.
-
-    Parameters
-    ----------
-    clock : ReferenceClock
-    lag : Lag
-        By which the newest of them was resampled.
-    normals : tuple of ReferenceNormalEquations or None
-        One per tone.
-    """
+    """Results of earlier segments of a stream for a reference."""
 
     clock: ReferenceClock = field(default_factory=ReferenceClock)
-    lag: Lag = NO_LAG
-    normals: tuple[ReferenceNormalEquations | None, ...] = ()
+    lag: Lag = NO_LAG  # by which the newest of them was resampled
+    normals: tuple[ReferenceNormalEquations | None, ...] = ()  # one per tone
 
     def at(
         self, lag: Lag, time: float, tones_hz: Array
@@ -88,10 +72,7 @@ def align_reference(
 ) -> AlignedReference | None:
     """Return a reference on the clock of a rest; None where it covers too little of it.
 
-    Parameters
-    ----------
-    known : ReferenceHistory, optional
-        From earlier parts of a stream; by default the rest alone is used.
+    `known`: from earlier parts of a stream; by default the rest alone is used.
     """
     if reference is None:
         return None
@@ -114,21 +95,14 @@ def align_reference(
 
 @dataclass(frozen=True, eq=False)
 class CleanedPieces:
-    """Pieces of a rest with and without cancellation of the reference's noise.
-
-    Parameters
-    ----------
-    raw : Pieces
-    cleaned, reference : Pieces, optional
-        With the common noise removed, and those of the reference; where the reference has samples.
-    relations : tuple of Relation or None
-        One per tone.
-    """
+    """Pieces of a rest with and without cancellation of the reference's noise."""
 
     raw: Pieces
+    # cleaned, reference: with the common noise removed, and those of the reference; where the
+    # reference has samples
     cleaned: Pieces | None
     reference: Pieces | None
-    relations: tuple[Relation | None, ...]
+    relations: tuple[Relation | None, ...]  # one per tone
 
     def best(self) -> Pieces:
         """Return the pieces, with noise cancelled at each tone of significant relation.
@@ -157,10 +131,7 @@ def clean_pieces(
 ) -> CleanedPieces:
     """Return the pieces of a rest, with and without reference-noise cancellation.
 
-    Parameters
-    ----------
-    known : ReferenceHistory, optional
-        As of `align_reference`.
+    `known`: as of `align_reference`.
     """
     none: tuple[Relation | None, ...] = (None,) * len(tones_hz)
     if reference is None:
@@ -197,22 +168,13 @@ def clean_pieces(
 
 @dataclass(frozen=True, eq=False)
 class JudgedTone:
-    """One tone of a rest, by the most precise pieces.
-
-    Parameters
-    ----------
-    gain : float
-        Ratio by which the reference reduces the sigma; NaN where it is not used.
-    detects : bool
-        Whether the reference detects the beacon, and is not used for this reason.
-    hidden : float
-        Bound of the beacon's undetected part in the reference, in sigmas of the phasor; zero where
-        the reference's position is declared.
-    """
+    """One tone of a rest, by the most precise pieces."""
 
     tone: Integrated
-    gain: float
-    detects: bool
+    gain: float  # ratio by which the reference reduces the sigma; NaN where it is not used
+    detects: bool  # whether the reference detects the beacon, and is not used for this reason
+    # bound of the beacon's undetected part in the reference, in sigmas of the phasor; zero where
+    # the reference's position is declared
     hidden: float
 
 
@@ -221,10 +183,7 @@ def judge_tone(
 ) -> JudgedTone:
     """Return a tone of a rest, with the reference where it reduces the sigma.
 
-    Parameters
-    ----------
-    best : Pieces
-        As from `Freed.best`, at the drive currents of the rest's middle.
+    `best`: as from `Freed.best`, at the drive currents of the rest's middle.
     """
     one, result = integrated(best, tone, time), cleaned.relations[tone]
     if result is None or not result.is_effective:
@@ -267,10 +226,7 @@ def _sent_there(tone: int, site: Site) -> float | None:
 def reference_findings(rests: list[list[JudgedTone]], site: Site) -> tuple[Finding, ...]:
     """Return the findings of a reference: tones it is not used for, and what it may hide.
 
-    Parameters
-    ----------
-    rests : list of list of JudgedTone
-        Each tone of each rest.
+    `rests`: each tone of each rest.
     """
 
     def where(chosen: Callable[[JudgedTone], bool]) -> str:

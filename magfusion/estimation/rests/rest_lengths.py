@@ -5,8 +5,8 @@ import numpy as np
 from magfusion.model.site import Site
 from magfusion.receiver.integration import LEAST_LENGTHS
 from magfusion.receiver.windows import LockinSettings, sent_frequencies_hz
+from magfusion.units import HOUR
 
-HOUR = 3600.0  # s
 LONGEST_PIECE = 8.0  # s
 PIECE_TURNS = 8.0  # of the closest tones against each other, in a piece
 UNKNOWN_TURN = 0.2  # of a tone, that an unknown clock may make in a piece that is searched

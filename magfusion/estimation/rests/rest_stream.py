@@ -43,53 +43,27 @@ MARGIN = 4.0  # s; of inertial samples that are kept before a segment
 
 @dataclass(frozen=True, eq=False)
 class RestState:
-    """Estimate of a rest so far.
+    """Estimate of a rest so far."""
 
-    Parameters
-    ----------
-    time : float
-        (s)
-    standing : bool
-        False once the platform has moved: then nothing else is reported.
-    duration : float
-        Of the rest as far as it is integrated (s).
-    samples : FieldSamples, optional
-        Its phasors, one epoch.
-    detected : bool ndarray, shape (channels,)
-    fixes : ExplainedFixes, optional
-        None while no beacon is detected.
-    trust : Trust
-    gain : ndarray, shape (channels,)
-        Ratio by which the reference reduces the sigmas of the newest segment; NaN where it is not
-        used.
-    """
-
-    time: float
-    standing: bool
-    duration: float
-    samples: FieldSamples | None
-    detected: BoolArray
-    fixes: ExplainedFixes | None
+    time: float  # (s)
+    standing: bool  # False once the platform has moved: then nothing else is reported
+    duration: float  # of the rest as far as it is integrated (s)
+    samples: FieldSamples | None  # its phasors, one epoch
+    detected: BoolArray  # (channels,)
+    fixes: ExplainedFixes | None  # None while no beacon is detected
     trust: Trust
+    # (channels,), ratio by which the reference reduces the sigmas of the newest segment; NaN where
+    # it is not used
     gain: Array
 
 
 class RestNavigator:
     """Running estimate of the pose of a platform at rest.
 
-    Parameters
-    ----------
-    lockin : LockinSettings, optional
-        Length of the pieces, and the mains; by default chosen by the tones.
-    false_alarm : float
-        Probability, per rest and beacon, of a false detection in any of its states.
-    risk : Risk, optional
-        Integrity risk of the protection levels.
-
-    Raises
-    ------
-    InputError
-        Where tones cannot be integrated, or there is not exactly one magnetometer of three axes.
+    `lockin`: length of the pieces, and the mains; by default chosen by the tones. `false_alarm`:
+    probability, per rest and beacon, of a false detection in any of its states. `risk`: integrity
+    risk of the protection levels. Raises InputError where tones cannot be integrated, or there is
+    not exactly one magnetometer of three axes.
     """
 
     def __init__(

@@ -22,34 +22,19 @@ LOOKS = 6.0 / np.pi**2  # share of the first look in the false alarms; then a fo
 
 @dataclass(frozen=True, eq=False)
 class RunningMean:
-    """Sums over all segments of a rest.
+    """Sums over all segments of a rest."""
 
-    Parameters
-    ----------
-    begin, end : float
-        Of the rest so far (s).
-    information : ndarray, shape (channels, 3, 3)
-        Of a phasor's real part, equal to that of its imaginary part (1/T^2).
-    weighted : complex ndarray, shape (channels, 3)
-        Phasors multiplied by their information (1/T).
-    squares : ndarray, shape (channels,)
-        Sum of the squares of the segments' shares, by their traces.
-    freedom : ndarray, shape (channels,)
-        Degrees of freedom of the covariances.
-    least_chance : ndarray, shape (channels,)
-        Least false-alarm probability of all segments, of beacons without synchronisation.
-    looks : int
-        Number of segments.
-    """
-
+    # begin, end: of the rest so far (s)
     begin: float
     end: float
+    # (channels, 3, 3), of a phasor's real part, equal to that of its imaginary part (1/T^2)
     information: Array
-    weighted: ComplexArray
-    squares: Array
-    freedom: Array
+    weighted: ComplexArray  # (channels, 3), phasors multiplied by their information (1/T)
+    squares: Array  # (channels,), sum of the squares of the segments' shares, by their traces
+    freedom: Array  # (channels,), degrees of freedom of the covariances
+    # (channels,), least false-alarm probability of all segments, of beacons without synchronisation
     least_chance: Array
-    looks: int = 0
+    looks: int = 0  # number of segments
 
     @staticmethod
     def begun(begin: float, channels: int) -> "RunningMean":
@@ -74,13 +59,9 @@ class RunningMean:
     ) -> "RunningMean":
         """Return the sums with one more segment.
 
-        Parameters
-        ----------
-        longest : float
-            Coherence time of the phases (s): in a longer rest older segments are weighted less.
-        requested : float
-            False-alarm probability below which a segment determines the phase of a beacon without
-            synchronisation.
+        `longest`: coherence time of the phases (s): in a longer rest older segments are weighted
+        less. `requested`: false-alarm probability below which a segment determines the phase of a
+        beacon without synchronisation.
         """
         window = float(rest.fields.window[0])
         kept = max(1.0 - window / longest, 0.0) if self.duration + window > longest else 1.0

@@ -43,31 +43,18 @@ LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
 
 @dataclass(frozen=True, eq=False)
 class IntegratedRests:
-    """The rests of a log, one epoch each.
+    """The rests of a log, one epoch each."""
 
-    Parameters
-    ----------
-    fields : FieldSamples
-        Synchronised beacons are always included; other beacons that are not detected have a NaN
-        phasor.
-    chance : ndarray, shape (n, channels)
-        Probability that noise alone reaches this amplitude, over all frequencies tried.
-    detected : bool ndarray, shape (n, channels)
-        Where ``chance`` is below the requested false-alarm rate.
-    dropped : mapping
-        Reason to number of rests.
-    findings : tuple of Finding
-        Undetected beacons, with upper bounds of their fields.
-    gain : ndarray, shape (n, channels), optional
-        Ratio by which the reference sensor reduces the sigma of a phasor; NaN where it is not
-        used.
-    """
-
+    # synchronised beacons are always included; other beacons that are not detected have a NaN
+    # phasor
     fields: FieldSamples
+    # (n, channels), probability that noise alone reaches this amplitude, over all frequencies tried
     chance: Array
-    detected: BoolArray
-    dropped: Mapping[str, int]
-    findings: tuple[Finding, ...] = ()
+    detected: BoolArray  # (n, channels), where ``chance`` is below the requested false-alarm rate
+    dropped: Mapping[str, int]  # reason to number of rests
+    findings: tuple[Finding, ...] = ()  # undetected beacons, with upper bounds of their fields
+    # (n, channels), ratio by which the reference sensor reduces the sigma of a phasor; NaN where it
+    # is not used
     gain: Array | None = None
 
     def log(self, log: Log) -> Log:
@@ -106,12 +93,7 @@ def _epochs_at_rest(
 ) -> tuple[list[tuple[tuple[float, float], float]], Counter[str]]:
     """Return the span and piece length of each epoch, and the counts of rejected rests.
 
-    Parameters
-    ----------
-    usual : LockinSettings
-        Chosen by the tones of the site.
-    lockin, least
-        As of `integrate_rests`.
+    `usual`: chosen by the tones of the site. `lockin`, `least`: as of `integrate_rests`.
     """
     longest, dropped = coherent(site), Counter[str]()
     spans: list[tuple[tuple[float, float], float]] = []
@@ -139,19 +121,10 @@ def integrate_rests(
 ) -> IntegratedRests:
     """Return the rests of a log with a waveform, one epoch each.
 
-    Parameters
-    ----------
-    lockin : LockinSettings, optional
-        Length of the pieces, and the mains; by default chosen by the tones.
-    false_alarm : float
-        Probability of detecting an absent beacon in a rest.
-    least : int
-        Minimum number of epochs: where there are fewer rests, each is divided.
-
-    Raises
-    ------
-    InputError
-        Where there is no waveform or no long rest, or coils are driven in time slots.
+    `lockin`: length of the pieces, and the mains; by default chosen by the tones. `false_alarm`:
+    probability of detecting an absent beacon in a rest. `least`: minimum number of epochs: where
+    there are fewer rests, each is divided. Raises InputError where there is no waveform or no long
+    rest, or coils are driven in time slots.
     """
     if log.waveform is None:
         raise InputError("has no magnetometer.parquet to integrate at rest; give the raw log")
@@ -183,12 +156,7 @@ def integrate_rests(
 
 
 def check_tones(site: Site) -> None:
-    """Raise an error for tones that cannot be integrated over whole rests.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for tones that cannot be integrated over whole rests."""
     if has_schedule(site):
         raise InputError("--at-rest integrates tones, but a beacon has time slots; omit --at-rest")
     if tones_of(site).reused:
@@ -232,23 +200,12 @@ def rests(log: Log, site: Site) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """One rest, or the part of it that makes one epoch.
+    """One rest, or the part of it that makes one epoch."""
 
-    Parameters
-    ----------
-    fields : FieldSamples
-        Of one epoch.
-    chance : ndarray, shape (channels,)
-        Probability that noise alone reaches this amplitude.
-    tones : list of JudgedTone
-    known : ReferenceHistory, optional
-        For later parts of the same stream.
-    """
-
-    fields: FieldSamples
-    chance: Array
+    fields: FieldSamples  # of one epoch
+    chance: Array  # (channels,), probability that noise alone reaches this amplitude
     tones: list[JudgedTone]
-    known: ReferenceHistory | None
+    known: ReferenceHistory | None  # for later parts of the same stream
 
 
 def rest_epoch(
@@ -262,14 +219,8 @@ def rest_epoch(
 ) -> Rest:
     """Return one rest as an epoch.
 
-    Parameters
-    ----------
-    span : tuple of float
-        Its beginning and end (s).
-    length : float
-        Of the pieces (s).
-    known : ReferenceHistory, optional
-        Results of earlier parts of a stream for its reference.
+    `span`: its beginning and end (s). `length`: of the pieces (s). `known`: results of earlier
+    parts of a stream for its reference.
     """
     assert log.waveform is not None
     rows = slice(*np.searchsorted(log.waveform.time, span))

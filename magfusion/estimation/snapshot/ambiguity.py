@@ -74,27 +74,18 @@ class _Image(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Relation of the hypotheses of every epoch to its best.
+    """Relation of the hypotheses of every epoch to its best."""
 
-    Parameters
-    ----------
-    kind : ndarray of str, shape (n, hypotheses)
-        Values of `Kind`.
-    owner : ndarray of str, shape (n, hypotheses)
-        The beacon of the symmetry; empty for the plane of several, and if there is none.
-    is_open : bool ndarray, shape (n, hypotheses)
-        An alternative that explains the epoch as well, within three sigma.
-    resolved : ndarray of str, shape (n, hypotheses)
-        Information that excluded an alternative, for messages; empty if none did or it is open.
-    azimuth : ndarray of str, shape (n,)
-        The beacon about which the azimuth is open; empty if it is not.
-    """
-
-    kind: Words
+    kind: Words  # (n, hypotheses), values of `Kind`
+    # (n, hypotheses), the beacon of the symmetry; empty for the plane of several, and if there is
+    # none
     owner: Words
+    # (n, hypotheses), an alternative that explains the epoch as well, within three sigma
     is_open: BoolArray
+    # (n, hypotheses), information that excluded an alternative, for messages; empty if none did or
+    # it is open
     resolved: Words
-    azimuth: Words
+    azimuth: Words  # (n,), the beacon about which the azimuth is open; empty if it is not
 
     @property
     def label(self) -> Words:
@@ -251,17 +242,10 @@ def _pose(kind: Kind, owner: str) -> str:
 
 
 class Ambiguities(NamedTuple):
-    """Symmetries that a log leaves open, and alternatives that it excludes.
+    """Symmetries that a log leaves open, and alternatives that it excludes."""
 
-    Parameters
-    ----------
-    epochs : dict of Kind to int
-        Number of epochs that each symmetry leaves open; only those with any.
-    open, resolved : list of str
-        Sentences.
-    """
-
-    epochs: dict[Kind, int]
+    epochs: dict[Kind, int]  # number of epochs that each symmetry leaves open; only those with any
+    # open, resolved: sentences
     open: list[str]
     resolved: list[str]
 

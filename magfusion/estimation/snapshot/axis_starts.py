@@ -25,26 +25,18 @@ from magfusion.estimation.snapshot.coil_starts import (
 from magfusion.estimation.snapshot.problem import FixProblem, FixState
 from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import predict_channels
-from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+from magfusion.units import TINY, Array, BoolArray, ComplexArray, IntArray
 
 KEPT = 24  # positions of the grid that are refined roughly
 SHAPE = 0.2  # error of the axes fitted there, relative to their length
 LEAST_TURN = 1e-6  # weight of the world's axes, to select the smallest of the open rotations
-_TINY = 1e-300
 
 
 def starts_on_grid(problem: FixProblem) -> tuple[FixState, int]:
     """Return the most probable states of epochs that lack components, so many rows an epoch.
 
-    Parameters
-    ----------
-    problem : FixProblem
-        Its whitening is zero where a component is missing.
-
-    Raises
-    ------
-    EstimationError
-        Where no grid can be built around the beacons.
+    `problem`: its whitening is zero where a component is missing. Raises EstimationError where no
+    grid can be built around the beacons.
     """
     requested = _AxisGrid.of(problem)
     result = [requested.starts(row) for row in range(len(problem.time))]
@@ -73,12 +65,7 @@ def mirrored(problem: FixProblem, state: FixState) -> FixState:
 def with_least_roll(problem: FixProblem, state: FixState) -> FixState:
     """Return states with the smallest rotation if the roll about the received axis is open.
 
-    Equal epochs then have equal poses, whatever the start.
-
-    Parameters
-    ----------
-    problem : FixProblem
-        For the same rows.
+    Equal epochs then have equal poses, whatever the start. `problem`: for the same rows.
     """
     informed = problem.prior is not None and problem.prior.sqrt_information is not None
     detected = np.any(np.einsum("...ii->...i", problem.sqrt_information) > 0.0, axis=1)
@@ -107,27 +94,15 @@ def phases_of(problem: FixProblem, state: FixState, free_parameters: BoolArray) 
 
 @dataclass(frozen=True, eq=False)
 class _AxisGrid:
-    """Grid, and the measurements of each axis at every epoch.
-
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, channels, 3)
-        (T)
-    there : bool ndarray, shape (n, channels, 3)
-    sigma : ndarray, shape (n, channels, 3)
-        Of the real and of the imaginary part (T).
-    axes_body : ndarray, shape (3, 3)
-        The receiver's axes, row by row, each times its gain.
-    free_parameters : bool ndarray, shape (channels,)
-        Channels of unknown drive phase: with any, the grid ignores signs.
-    """
+    """Grid, and the measurements of each axis at every epoch."""
 
     problem: FixProblem
     grid: CoilGrid
-    phasor: ComplexArray
-    there: BoolArray
-    sigma: Array
-    axes_body: Array
+    phasor: ComplexArray  # (n, channels, 3) (T)
+    there: BoolArray  # (n, channels, 3)
+    sigma: Array  # (n, channels, 3), of the real and of the imaginary part (T)
+    axes_body: Array  # (3, 3), the receiver's axes, row by row, each times its gain
+    # (channels,), channels of unknown drive phase: with any, the grid ignores signs
     free_parameters: BoolArray
     bases: dict[bytes, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -191,7 +166,7 @@ class _AxisGrid:
         target = np.where(there, given, 0.0) * scale
         along = (target[:, None] @ basis)[:, 0]
         total = np.sum(target**2, axis=1)
-        return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY))
+        return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, TINY))
 
     def _basis(self, there: BoolArray) -> tuple[Array, Array]:
         """Return the weights of rows at each position, and a basis of all predictions there."""
@@ -233,7 +208,7 @@ class _AxisGrid:
         length = np.linalg.norm(axes, axis=-1, keepdims=True)
         body = self.axes_body[own]
         body = body / np.linalg.norm(body, axis=-1, keepdims=True)
-        along = np.einsum("gki,kj->gij", axes / np.maximum(length, _TINY), body)
+        along = np.einsum("gki,kj->gij", axes / np.maximum(length, TINY), body)
         gravity = self.problem.gravity
         if gravity is not None and np.isfinite(gravity.sigma[row]):
             along[:, 2] += gravity.up_body[row]

@@ -12,28 +12,18 @@ import numpy as np
 from magfusion.model.ground import range_of_strength, sphere
 from magfusion.model.parameters import Calibration, initial_calibration, predict_channels
 from magfusion.model.site import Beacon, Site
-from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
+from magfusion.units import MU0_OVER_4PI, TINY, Array, BoolArray, ComplexArray
 
 AROUND = 96  # directions of a beacon in conducting ground
 AZIMUTHS = 16  # on the cone that an unknown drive phase leaves open
 ALTERNATIONS = 4  # between attitude and drive phases
-_TINY = 1e-300
 
 
 def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     """Return directions and ranges from a beacon consistent with its phasors at any attitude.
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, tones, 3)
-        (T), in any axes.
-
-    Returns
-    -------
-    direction_beacon : ndarray, shape (n, candidates, 3)
-        Unit vectors.
-    distance : ndarray, shape (n, candidates)
-        (m)
+    `phasor` (n, tones, 3) (T), in any axes. Returns `direction_beacon` (n, candidates, 3): unit
+    vectors; `distance` (n, candidates) (m).
     """
     if beacon.conductivity:
         return _directions_in_ground(beacon, phasor)
@@ -75,7 +65,7 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
             direction = _planar_directions(beacon, power, axes, residual)
     seen = 3.0 * direction[..., None] * (direction @ moments)[..., None, :] - moments
     strength = np.sqrt(np.sum(seen**2, axis=(-1, -2)))
-    total = np.sqrt(np.sum(measured**2, axis=(1, 2)))[:, None] + _TINY
+    total = np.sqrt(np.sum(measured**2, axis=(1, 2)))[:, None] + TINY
     return direction, np.asarray(np.cbrt(MU0_OVER_4PI * strength / total))
 
 
@@ -95,7 +85,7 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, residual: Arra
 
     Its eigenvalues are ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine of the angle from the normal.
     """
-    least = np.maximum(power[:, 0], np.maximum(0.25 * power[:, 1], _TINY))
+    least = np.maximum(power[:, 0], np.maximum(0.25 * power[:, 1], TINY))
     sine_square = np.clip((power[:, 1] / least - 1.0) / 3.0, 0.0, 1.0)
     sine, cosine = np.sqrt(sine_square)[:, None, None], np.sqrt(1.0 - sine_square)[:, None, None]
     if beacon.synchronised or len(beacon.tones) > 1:
@@ -112,19 +102,9 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, residual: Arra
 def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, keep: int) -> Array:
     """Return the sensor positions that agree best in attitude-independent quantities.
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (n, channels, 3)
-        (T), calibrated axes; zero where missing.
-    weight : ndarray, shape (n, channels)
-        Inverse variance of a component (1/T^2); zero where missing.
-    keep : int
-        Candidates returned for each epoch.
-
-    Returns
-    -------
-    ndarray, shape (n, keep, 3)
-        Of the sensor, world (m).
+    `phasor` (n, channels, 3) (T), calibrated axes; zero where missing. `weight` (n, channels):
+    inverse variance of a component (1/T^2); zero where missing. `keep`: candidates returned for
+    each epoch. Returns (n, keep, 3): of the sensor, world (m).
     """
     site = calibration.site
     result, start = [], 0
@@ -158,7 +138,7 @@ def _invariant_cost(
     predicted = _predicted_at(calibration, sensor_world)
     ours, others = _invariants(predicted), _invariants(phasor)[:, None]
     # Relative to amplitude the error of a squared axis is twice that of the phasor.
-    variance = 1.0 / np.maximum(weight, _TINY)[:, None] * 4.0 * (others[..., 0] + _TINY)
+    variance = 1.0 / np.maximum(weight, TINY)[:, None] * 4.0 * (others[..., 0] + TINY)
     floor = 0.05**2 * others[..., 0] ** 2  # candidates are coarse
     relative = np.sum((ours - others) ** 2, axis=-1) / (floor + variance)
     return np.sum(np.where(weight[:, None] > 0, np.log1p(relative), 0.0), axis=-1)
@@ -196,24 +176,11 @@ def attitudes(
 ) -> tuple[Array, Array]:
     """Solve Wahba's problem at each candidate position.
 
-    Parameters
-    ----------
-    sensor_world : ndarray, shape (n, c, 3)
-        (m)
-    phasor : complex ndarray, shape (n, channels, 3)
-        (T), calibrated axes.
-    weight : ndarray, shape (n, channels)
-        (1/T^2)
-    free_parameters : bool ndarray, shape (channels,)
-        Channels whose drive phase is unknown.
-    up_sensor, up_weight : ndarray, shape (n, 3) and (n,), optional
-        Direction of the specific force at rest, and its weight (1/rad^2).
-
-    Returns
-    -------
-    world_from_sensor : ndarray, shape (n, c, 3, 3)
-    phase : ndarray, shape (n, c, channels)
-        (rad); zero where it is known.
+    `sensor_world` (n, c, 3) (m). `phasor` (n, channels, 3) (T), calibrated axes.
+    `weight` (n, channels) (1/T^2). `free_parameters` (channels,): channels whose drive phase is
+    unknown. `up_sensor`, `up_weight` (n, 3) and (n,): direction of the specific force at rest, and
+    its weight (1/rad^2). Returns `world_from_sensor` (n, c, 3, 3); `phase` (n, c, channels) (rad);
+    zero where it is known.
     """
     world = _predicted_at(calibration, sensor_world)
     measured, share = phasor[:, None], weight[:, None]
@@ -243,7 +210,7 @@ def attitudes(
 def _normal(phasor: ComplexArray) -> Array:
     """Return the normal of each phasor's ellipse, of length one for a circle, zero for a line."""
     power = 0.5 * np.sum(np.abs(phasor) ** 2, axis=-1, keepdims=True)
-    return np.cross(phasor.real, phasor.imag) / (power + _TINY)
+    return np.cross(phasor.real, phasor.imag) / (power + TINY)
 
 
 def _between_tones(site: Site, world: ComplexArray, measured: ComplexArray, power: Array) -> Array:
@@ -261,7 +228,7 @@ def _long_axis(phasor: ComplexArray) -> Array:
     """Return the direction of the long axis of a phasor's ellipse, of either sign."""
     turn = np.exp(-0.5j * np.angle(np.sum(phasor**2, axis=-1, keepdims=True)))
     axis = np.real(phasor * turn)
-    return axis / (np.linalg.norm(axis, axis=-1, keepdims=True) + _TINY)
+    return axis / (np.linalg.norm(axis, axis=-1, keepdims=True) + TINY)
 
 
 def _plane(axes: Array) -> Array:

@@ -18,6 +18,7 @@ from magfusion.estimation.snapshot.coil_starts import (
     mirror,
     softened,
 )
+from magfusion.estimation.snapshot.place import SOFT_EDGE
 from magfusion.estimation.solve.batched import (
     Model,
     NormalEquations,
@@ -33,7 +34,6 @@ from magfusion.units import Array, BoolArray, IntArray
 
 DUPLICATE_DISTANCE = 1e-3  # of the distance; hypotheses closer to one another are one
 RIVAL = 25.0  # chi square above the best, from which a hypothesis is dropped
-SOFT_EDGE = 0.02  # of the distance; uncertainty of a declared plane
 LEAST_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
 UNKNOWNS = 6  # of position, direction and gain
 CHUNK = 200  # epochs refined at once
@@ -43,17 +43,10 @@ ROUGH = 1e-4  # relative decrease of the cost below which a start has converged
 
 
 class Gain(NamedTuple):
-    """Prior of a coil's gain.
-
-    Parameters
-    ----------
-    nominal : float
-    sigma : float
-        Standard deviation of its logarithm; infinite if it is unknown.
-    """
+    """Prior of a coil's gain."""
 
     nominal: float = 1.0
-    sigma: float = np.inf
+    sigma: float = np.inf  # standard deviation of its logarithm; infinite if it is unknown
 
     @staticmethod
     def of(sensor: Magnetometer, *, free_parameters: bool) -> "Gain":
@@ -66,47 +59,24 @@ class Gain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CoilFixes:
-    """Hypotheses of a coil at each epoch, the most probable first.
+    """Hypotheses of a coil at each epoch, the most probable first."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, hypotheses, 3)
-        Of the coil (m).
-    axis_world : ndarray, shape (n, hypotheses, 3)
-        Its axis times its gain; of unknown sign if the amplitudes have none.
-    cov : ndarray, shape (n, hypotheses, 6, 6)
-        Of position and axis.
-    cost : ndarray, shape (n, hypotheses)
-        Minus twice the logarithm of their likelihood, the first of each epoch its chi square;
-        infinite if an epoch has fewer.
-    determined : bool ndarray, shape (n, hypotheses)
-        False where position, direction or gain is open.
-    freedom : ndarray, shape (n,)
-        Degrees of freedom of the chi square.
-    """
-
-    position_world: Array
+    position_world: Array  # (n, hypotheses, 3), of the coil (m)
+    # (n, hypotheses, 3), its axis times its gain; of unknown sign if the amplitudes have none
     axis_world: Array
-    cov: Array
+    cov: Array  # (n, hypotheses, 6, 6), of position and axis
+    # (n, hypotheses), minus twice the logarithm of their likelihood, the first of each epoch its
+    # chi square; infinite if an epoch has fewer
     cost: Array
-    determined: BoolArray
-    freedom: Array
+    determined: BoolArray  # (n, hypotheses), False where position, direction or gain is open
+    freedom: Array  # (n,), degrees of freedom of the chi square
 
 
 def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFixes:
     """Return position and direction of the coil at each epoch.
 
-    Parameters
-    ----------
-    epochs : CoilEpochs
-        At least one.
-    gain : Gain
-        Of the coil.
-
-    Raises
-    ------
-    EstimationError
-        Where the declared region contains no position to test.
+    `epochs`: at least one. `gain`: of the coil. Raises EstimationError where the declared region
+    contains no position to test.
     """
     known = at_point(calibration)
     places = grid_about(known.site)
@@ -191,7 +161,7 @@ def _solved(problem: "_Problem", start: Array) -> _Refined:
         sign = np.ones_like(state)
         sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
         state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
-    there = epochs.channel_count * (2.0 if epochs.signed else 1.0)
+    there = np.sum(np.isfinite(epochs.measured), axis=1) * (2.0 if epochs.signed else 1.0)
     freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(problem.gain.sigma)))
     return _Refined(state, cov, cost, chi_square, determined.reshape(-1, count), freedom)
 

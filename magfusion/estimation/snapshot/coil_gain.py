@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.data_checks.statistics import MAD_TO_SIGMA
 from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, Gain, fix_coil
 from magfusion.estimation.snapshot.coil_starts import CoilEpochs
 from magfusion.model.parameters import initial_calibration
@@ -14,23 +15,13 @@ from magfusion.model.site import Site
 MAX_EPOCHS = 60  # epochs, spread over a log
 MIN_COUNT = 5  # of them, that determine a gain
 LEAST_SIGMA = 0.01  # of the logarithm; model errors are common to all epochs
-TO_SIGMA = 1.4826  # of the median deviation
 
 
 def with_found_gain(fields: FieldSamples, site: Site) -> Site:
     """Return a site whose one axis has the gain estimated from its epochs, with their scatter.
 
-    Its declared value is not used; the smoother estimates it further, from that prior.
-
-    Parameters
-    ----------
-    fields : FieldSamples
-        Channels in the site's order.
-
-    Raises
-    ------
-    EstimationError
-        Where too few epochs determine a gain.
+    Its declared value is not used; the smoother estimates it further, from that prior. `fields`:
+    channels in the site's order. Raises EstimationError where too few epochs determine a gain.
     """
     sensor = site.platform.magnetometer
     epochs = CoilEpochs.of(fields, site)
@@ -51,7 +42,7 @@ def with_found_gain(fields: FieldSamples, site: Site) -> Site:
             " magnetometer.matrix"
         )
     middle = float(np.median(log_gain))
-    scatter = TO_SIGMA * float(np.median(np.abs(log_gain - middle)))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(log_gain - middle)))
     row = "xyz".index(sensor.axes)
     factor = np.exp(middle) / np.linalg.norm(sensor.matrix[row])
     matrix, sigma = sensor.matrix.copy(), sensor.sigma.matrix.copy()

@@ -24,15 +24,8 @@ FEW = 0.1  # share of the epochs; a larger one casts doubt
 def poses_of(result: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
     """Return the poses for a coil's positions and directions, with an arbitrary, open roll.
 
-    The smallest rotation that aligns the axis is selected, so that equal epochs have equal
-    poses.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    signed : bool
-        Whether the sense of the axis is known.
+    The smallest rotation that aligns the axis is selected, so that equal epochs have equal poses.
+    `time` (n,) (s). `signed`: whether the sense of the axis is known.
     """
     sensor = site.platform.magnetometer
     lever_body, sigma = coil_lever(sensor), sensor.sigma
@@ -108,10 +101,7 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
 def nearest_reported(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajectory, BoolArray]:
     """Return the hypothesis nearest to the truth at each epoch, and where it is not the first.
 
-    Parameters
-    ----------
-    fixes : Fixes
-        As `JudgedPoses.alone`.
+    `fixes`: as `JudgedPoses.alone`.
     """
     true, there, _ = truth_poses(truth, fixes.time)
     rows = np.arange(len(fixes))
@@ -134,16 +124,10 @@ def nearest_reported(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Traje
 
 @dataclass(frozen=True, eq=False)
 class JudgedPoses:
-    """Poses whose covariances cover alternatives and residuals, with findings.
-
-    Parameters
-    ----------
-    alone : Fixes
-        Each with the covariance of its own hypothesis.
-    """
+    """Poses whose covariances cover alternatives and residuals, with findings."""
 
     fixes: Fixes
-    alone: Fixes
+    alone: Fixes  # each with the covariance of its own hypothesis
     states: StateTrust
     trust: Trust
 
@@ -151,10 +135,7 @@ class JudgedPoses:
 def judged_poses(fixes: Fixes, result: CoilFixes, left_out: int, *, signed: bool) -> JudgedPoses:
     """Return the verdict on each pose and on all.
 
-    Parameters
-    ----------
-    left_out : int
-        Epochs with too few channels.
+    `left_out`: epochs with too few channels.
     """
     count = len(fixes)
     log_p = log_p_chi_square(result.cost[:, 0], np.maximum(result.freedom, 1.0))

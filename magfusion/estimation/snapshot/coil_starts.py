@@ -15,43 +15,28 @@ from magfusion.model.one_axis import axis_of
 from magfusion.model.parameters import Calibration, predict_channels
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Magnetometer, MagnetometerSigma, Site
-from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+from magfusion.units import TINY, Array, BoolArray, ComplexArray, IntArray
 
 DIRECTIONS, RADII = 400, 28  # of the grid around the beacons
 NEAREST, FARTHEST = 0.15, 8.0  # of their extent
 LIKELY, KEPT = 400, 40  # grid positions that are evaluated again, and that are refined
 SOFT, FLOOR = 0.1, 0.01  # error at a grid position: of an amplitude, of the largest
 FLAT = 1e-9  # of the largest singular value; smaller combinations of channels are unobservable
-_TINY = 1e-300
 _PAIRS = np.triu_indices(3)
 
 
 @dataclass(frozen=True, eq=False)
 class CoilEpochs:
-    """Measurements of a coil.
+    """Measurements of a coil."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : complex ndarray, shape (n, channels)
-        Phasors, or amplitudes (T); NaN where missing.
-    sigma : ndarray, shape (n, channels)
-        Of the real and of the imaginary part (T).
-    signed : bool
-        Whether the phase determines the sign.
-    parts : ndarray, shape (channels,), optional
-        Real values of each: two if its field rotates and phases are known, else one.
-    swing, shift : ndarray, shape (n, channels), optional
-        Rotation of the coil since the measurement, or its limit (rad), and one sigma of its
-        displacement (m), if channels are measured in turn.
-    """
-
-    time: Array
-    measured: ComplexArray
-    sigma: Array
-    signed: bool
+    time: Array  # (n,) (s)
+    measured: ComplexArray  # (n, channels), phasors, or amplitudes (T); NaN where missing
+    sigma: Array  # (n, channels), of the real and of the imaginary part (T)
+    signed: bool  # whether the phase determines the sign
+    # (channels,), real values of each: two if its field rotates and phases are known, else one
     parts: IntArray | None = None
+    # swing, shift: (n, channels), rotation of the coil since the measurement, or its limit (rad),
+    # and one sigma of its displacement (m), if channels are measured in turn
     swing: Array | None = None
     shift: Array | None = None
 
@@ -78,11 +63,6 @@ class CoilEpochs:
         own = self.time[kept], self.measured[kept], self.sigma[kept]
         motion = (None if part is None else part[kept] for part in (self.swing, self.shift))
         return CoilEpochs(*own, self.signed, self.parts, *motion)
-
-    @property
-    def channel_count(self) -> IntArray:
-        """Number of channels in each row, shape (n,)."""
-        return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
 
     @property
     def number_count(self) -> IntArray:
@@ -140,11 +120,7 @@ def grid_about(site: Site) -> Array:
     """Return positions to evaluate, shape (g, 3) (m): on spheres around the beacons.
 
     Those outside of the region are included, as some converge to the other side and are mirrored.
-
-    Raises
-    ------
-    EstimationError
-        Where none is inside of the region.
+    Raises EstimationError where none is inside of the region.
     """
     middle, extent = middle_of(site.beacons)
     number = np.arange(DIRECTIONS) + 0.5
@@ -163,24 +139,12 @@ def grid_about(site: Site) -> Array:
 
 
 class CoilGrid(NamedTuple):
-    """Positions, and the response of a coil at each to every axis, or pair of axes.
+    """Positions, and the response of a coil at each to every axis, or pair of axes."""
 
-    Parameters
-    ----------
-    places_world : ndarray, shape (g, 3)
-        (m)
-    field : complex ndarray, shape (g, channels, 3)
-        (T), world axes.
-    design : ndarray, shape (g, rows, unknowns)
-        Of the axis, or of its products.
-    scale : ndarray, shape (g, rows)
-        Weights of the rows: relative to the field, equal everywhere.
-    """
-
-    places_world: Array
-    field: ComplexArray
-    design: Array
-    scale: Array
+    places_world: Array  # (g, 3) (m)
+    field: ComplexArray  # (g, channels, 3) (T), world axes
+    design: Array  # (g, rows, unknowns), of the axis, or of its products
+    scale: Array  # (g, rows), weights of the rows: relative to the field, equal everywhere
 
     @staticmethod
     def of(
@@ -191,7 +155,7 @@ class CoilGrid(NamedTuple):
         at = np.full(len(places_world), time)
         field = predict_channels(calibration, at, attitude, places_world)
         size = np.linalg.norm(field, axis=2)
-        scale = np.where(size > 0.0, 1.0 / np.maximum(size, _TINY), 0.0)
+        scale = np.where(size > 0.0, 1.0 / np.maximum(size, TINY), 0.0)
         if signed:
             parts = np.concatenate([field.real, field.imag], axis=1)
             return CoilGrid(places_world, field, parts, np.concatenate([scale, scale], axis=1))
@@ -219,7 +183,7 @@ class CoilGrid(NamedTuple):
                 target = np.where(pattern, given[row], 0.0) * scale
                 along = (target[:, None] @ residual)[:, 0]
                 total = np.sum(target**2, axis=1)
-                cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY)
+                cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, TINY)
                 best = np.argsort(cost, kind="stable")[:LIKELY]
                 result = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
                 axes = result[..., 0] if epochs.signed else roots(result[..., 0])
@@ -239,7 +203,7 @@ class CoilGrid(NamedTuple):
         seen = np.where(there, seen, 0.0) / sigma
         measured = np.where(there, epochs.measured[row], 0.0) / sigma
         size = np.sum(np.abs(seen) ** 2, axis=1)
-        factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, _TINY)
+        factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, TINY)
         residual = measured - factor[:, None] * seen
         return np.sum(np.abs(residual) ** 2, axis=1), axes * factor[:, None]
 
@@ -259,4 +223,4 @@ def roots(pairs: Array) -> Array:
     matrix[:, _PAIRS[1], _PAIRS[0]] = pairs
     value, vector = np.linalg.eigh(matrix)
     least = 1e-6 * np.max(np.abs(value), axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.maximum(value[:, -1:], least + _TINY)) * vector[:, :, -1])
+    return np.asarray(np.sqrt(np.maximum(value[:, -1:], least + TINY)) * vector[:, :, -1])

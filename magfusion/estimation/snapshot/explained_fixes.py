@@ -27,23 +27,12 @@ OF_FIELDS = ("field_residuals", "separation")  # codes of inconsistent fields
 
 @dataclass(frozen=True, eq=False)
 class ExplainedFixes:
-    """Fixes with their findings.
+    """Fixes with their findings."""
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With covariances that cover the findings.
-    states : StateTrust
-        Of each epoch.
-    trust : Trust
-        Of the whole.
-    gain_spread : float
-        Standard deviation of the log-gains estimated with the poses; zero if they are fixed.
-    """
-
-    fixes: Fixes
-    states: StateTrust
-    trust: Trust
+    fixes: Fixes  # with covariances that cover the findings
+    states: StateTrust  # of each epoch
+    trust: Trust  # of the whole
+    # standard deviation of the log-gains estimated with the poses; zero if they are fixed
     gain_spread: float
 
 
@@ -62,21 +51,10 @@ def explained_fixes(
     A spread of gains is estimated if the fixes with fixed gains, without the one faulty beacon,
     still contradict the fields; it is used if it removes the contradiction.  If most epochs receive
     one beacon it is not: its gain and range are not separable, and any error would change position.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Channels in the site's order.
-    gravity, survey_error, free_parameters
-        As in `magfusion.estimation.snapshot.likelihood.fix_epochs`; with ``gain`` the spread is
-        always estimated and used.
-    risk : Risk, optional
-        Requirements for the protection levels.
-
-    Raises
-    ------
-    EstimationError
-        Where there is no epoch.
+    `samples`: channels in the site's order. `gravity`, `survey_error`, `free_parameters`: as in
+    `magfusion.estimation.snapshot.likelihood.fix_epochs`; with ``gain`` the spread is always
+    estimated and used. `risk`: requirements for the protection levels. Raises EstimationError where
+    there is no epoch.
     """
     how = _How(samples, calibration, gravity, survey_error, Risk() if risk is None else risk)
     fixed = tuple(part for part in free_parameters if part != "gain")

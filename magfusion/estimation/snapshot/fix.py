@@ -9,20 +9,14 @@ from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
+AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
+
 
 class Gravity(NamedTuple):
-    """Direction of the specific force, if the platform is at rest or nearly so.
+    """Direction of the specific force, if the platform is at rest or nearly so."""
 
-    Parameters
-    ----------
-    up_body : ndarray, shape (n, 3)
-        Unit vectors.
-    sigma : ndarray, shape (n,)
-        (rad); infinite if it is not available.
-    """
-
-    up_body: Array
-    sigma: Array
+    up_body: Array  # (n, 3), unit vectors
+    sigma: Array  # (n,) (rad); infinite if it is not available
 
     def rows(self, chosen: IntArray | BoolArray | slice) -> "Gravity":
         """Return it at selected epochs, possibly repeated."""
@@ -31,43 +25,27 @@ class Gravity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fixes:
-    """Hypotheses of the pose at each epoch in order of their posterior.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    world_from_body : ndarray, shape (n, hypotheses, 3, 3)
-    position_world : ndarray, shape (n, hypotheses, 3)
-        (m)
-    pose_cov : ndarray, shape (n, hypotheses, 6, 6)
-        Rotation, then position; body axes (rad, m).
-    cost : ndarray, shape (n, hypotheses)
-        Squared residual in units of its sigma, plus that of the prior; infinite where a row has
-        fewer hypotheses.
-    residual_rms : ndarray, shape (n, hypotheses)
-        Root mean square of the whitened residual; about one where noise and model are as declared.
-    phase : ndarray, shape (n, hypotheses, channels)
-        Drive phase (rad); zero if it was not estimated.
-    determined : bool ndarray, shape (n, hypotheses)
-        False if the epoch does not determine a direction of the pose.
-    log_gain : ndarray, shape (n, hypotheses, channels)
-        Logarithm of each channel's gain; zero if it was not estimated.
-    gravity_cost, prior_cost : ndarray, shape (n, hypotheses)
-        Contributions of gravity and the prior pose to the cost; zero without them.
-    """
+    """Hypotheses of the pose at each epoch in order of their posterior."""
 
     __repr__ = short_repr
 
-    time: Array
-    world_from_body: Array
-    position_world: Array
-    pose_cov: Array
+    time: Array  # (n,) (s)
+    world_from_body: Array  # (n, hypotheses, 3, 3)
+    position_world: Array  # (n, hypotheses, 3) (m)
+    pose_cov: Array  # (n, hypotheses, 6, 6), rotation, then position; body axes (rad, m)
+    # (n, hypotheses), squared residual in units of its sigma, plus that of the prior; infinite
+    # where a row has fewer hypotheses
     cost: Array
+    # (n, hypotheses), root mean square of the whitened residual; about one where noise and model
+    # are as declared
     residual_rms: Array
-    phase: Array
+    phase: Array  # (n, hypotheses, channels), drive phase (rad); zero if it was not estimated
+    # (n, hypotheses), False if the epoch does not determine a direction of the pose
     determined: BoolArray
+    # (n, hypotheses, channels), logarithm of each channel's gain; zero if it was not estimated
     log_gain: Array
+    # gravity_cost, prior_cost: (n, hypotheses), contributions of gravity and the prior pose to the
+    # cost; zero without them
     gravity_cost: Array
     prior_cost: Array
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, log_p_chi_square
+from magfusion.estimation.posterior.separation import POSE
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.priors import TOLERATED, unexplained
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict, worst
@@ -14,7 +15,6 @@ from magfusion.units import Array, BoolArray, IntArray
 
 RIVAL = 0.05  # posterior probability from which a second pose counts
 FEW = 0.05  # share of epochs that may be open before the whole is in doubt
-UNKNOWNS = 6
 
 
 def judged_fixes(
@@ -24,12 +24,8 @@ def judged_fixes(
 
     The covariance of an epoch with an alternative is that of both poses with their posterior
     probabilities, about the first.  Errors of the survey are common to all epochs, so that all
-    residuals are tested as one: the median's.
-
-    Parameters
-    ----------
-    numbers : ndarray, shape (n,)
-        Number of real values measured at each epoch.
+    residuals are tested as one: the median's. `numbers` (n,): number of real values measured at
+    each epoch.
     """
     rival = _rival(fixes)
     open_pose = ~fixes.determined[:, 0]
@@ -54,11 +50,7 @@ def judged_fixes(
         for verdict, doubt in zip(states.verdict, doubtful.tolist(), strict=True)
     )
     findings = (*whole.findings, *_of_epochs(rival, open_pose, odd & ~bool(whole.findings)))
-    return (
-        replace(fixes, pose_cov=cov),
-        replace(states, verdict=verdicts),
-        Trust(findings),
-    )
+    return (replace(fixes, pose_cov=cov), replace(states, verdict=verdicts), Trust(findings))
 
 
 def _rival(fixes: Fixes) -> BoolArray:
@@ -70,7 +62,7 @@ def _chi_square(fixes: Fixes, numbers: IntArray) -> tuple[Array, Array]:
     """Return the chi square of each epoch's best pose and its degrees of freedom."""
     result = np.sum(fixes.phase[:, 0] != 0.0, axis=1) + np.sum(fixes.log_gain[:, 0] != 0.0, axis=1)
     known = 2.0 * (fixes.gravity_cost[:, 0] > 0.0)
-    return fixes.cost[:, 0], np.maximum(numbers + known - UNKNOWNS - result, 0.0)
+    return fixes.cost[:, 0], np.maximum(numbers + known - POSE - result, 0.0)
 
 
 def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from magfusion.estimation.data_checks.magnetometers import of_sensors
 from magfusion.estimation.data_checks.statistics import P_CERTAIN
-from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.fix import AS_LIKELY, Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.fields import SAME_TIME
 from magfusion.model.parameters import Calibration, seen_by
@@ -20,7 +20,6 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding
 from magfusion.units import Array
 
-AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
 MIN_EPOCHS = 5  # common epochs needed to test a pair
 
 
@@ -29,12 +28,8 @@ def contradicting_magnetometers(
 ) -> tuple[Finding, ...]:
     """Return findings for magnetometers that contradict each other about the pose.
 
-    Of three or more, one that contradicts all others while these agree is identified.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Channels in the site's order.
+    Of three or more, one that contradicts all others while these agree is identified. `samples`:
+    channels in the site's order.
     """
     sensors = calibration.site.platform.magnetometers
     if len(sensors) == 1:

@@ -26,24 +26,14 @@ MIN_DETECTED = 3  # beacons; of two that contradict each other either may be fau
 
 
 class SeparatedFixes(NamedTuple):
-    """Fixes after the exclusion of faulty beacons.
+    """Fixes after the exclusion of faulty beacons."""
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With a covariance that covers an alarm not attributed to a beacon.
-    states : StateTrust
-        Doubtful where there is an alarm that no exclusion explains.
-    excess : ndarray, shape (n, beacons)
-        Distance of the fix without each beacon from the fix with all, relative to its threshold.
-    shift_m : ndarray, shape (n, beacons)
-        The same in metres.
-    """
-
-    fixes: Fixes
-    states: StateTrust
+    fixes: Fixes  # with a covariance that covers an alarm not attributed to a beacon
+    states: StateTrust  # doubtful where there is an alarm that no exclusion explains
+    # (n, beacons), distance of the fix without each beacon from the fix with all, relative to its
+    # threshold
     excess: Array
-    shift_m: Array
+    shift_m: Array  # (n, beacons), the same in metres
 
 
 @dataclass(frozen=True)
@@ -130,12 +120,8 @@ def separate_fixes(
 ) -> SeparatedFixes:
     """Compare every fix with those without each beacon; exclude the faulty one.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Of the fixes.
-    gravity, survey_error, free_parameters, gain_sigma
-        Those of the fixes, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
+    `samples`: of the fixes. `gravity`, `survey_error`, `free_parameters`, `gain_sigma`: those of
+    the fixes, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
     """
     risk = Risk() if risk is None else risk
     how = _How(samples, calibration, gravity, survey_error, free_parameters, gain_sigma)

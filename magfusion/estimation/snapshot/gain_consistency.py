@@ -4,24 +4,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import MAD_TO_SIGMA
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 
 BEYOND = 3.0  # declared sigmas
 STEADY = 2.0  # times its own scatter, for a gain error that is equal everywhere
-MAD = 1.4826  # ratio of standard deviation and median absolute deviation, normal distribution
 
 
 def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
     """Yield a finding for estimated gains, and one for each wrong moment.
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With a gain of every beacon.
-    spread : float
-        Standard deviation of a log-gain.
+    `fixes`: with a gain of every beacon. `spread`: standard deviation of a log-gain.
     """
     yield Finding(
         "gain_spread",
@@ -38,7 +33,7 @@ def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
             continue
         middle = float(np.median(own))
         declared = float(np.max(beacon.sigma.log_moment))
-        scatter = MAD * float(np.median(np.abs(own - middle)))
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(own - middle)))
         if abs(middle) > max(BEYOND * declared, STEADY * scatter):
             yield Finding(
                 "moments",

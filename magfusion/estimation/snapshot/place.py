@@ -36,18 +36,9 @@ def margins(
 ) -> tuple[Array, Array]:
     """Return the distance of the magnetometer inside of each plane, and its standard deviation.
 
-    Parameters
-    ----------
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-        Of the body (m).
-    position_cov : ndarray, shape (n, 3, 3)
-        Body axes (m^2).
-
-    Returns
-    -------
-    margin, sigma : ndarray, shape (n, planes)
-        (m); includes the uncertainty of a declared plane.
+    `world_from_body` (n, 3, 3). `position_world` (n, 3): of the body (m). `position_cov` (n, 3, 3):
+    body axes (m^2). Returns `margin`, `sigma` (n, planes) (m); includes the uncertainty of a
+    declared plane.
     """
     assert site.bounds is not None
     sensor = position_world + world_from_body @ site.platform.magnetometer.position_body

@@ -19,26 +19,17 @@ from magfusion.estimation.data_checks.statistics import (
     holm,
     log_p_chi_square,
 )
-from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.model.trust import LISTED, Finding, Trust, Verdict
 from magfusion.units import Array
 
 MOVED = 0.01  # of the prior's variance; below, the data do not determine a direction
-NAMED = 3  # parameters in a sentence
 
 
 class Contradiction(NamedTuple):
-    """Result of a test of a calibration against the declared values.
+    """Result of a test of a calibration against the declared values."""
 
-    Parameters
-    ----------
-    findings : tuple of Finding
-        None, or one.
-    excess : float
-        Factor by which variances are too small, one if nothing is contradicted.
-    """
-
-    findings: tuple[Finding, ...]
-    excess: float
+    findings: tuple[Finding, ...]  # None, or one
+    excess: float  # factor by which variances are too small, one if nothing is contradicted
 
 
 def contradiction(
@@ -81,7 +72,7 @@ def contradiction(
     informative, least = holm(chance), float(np.min(chance))
     if not np.any(informative):
         return Contradiction((), 1.0)
-    order = np.argsort(single)[: max(1, min(NAMED, int(np.sum(informative[:-1]))))]
+    order = np.argsort(single)[: max(1, min(LISTED, int(np.sum(informative[:-1]))))]
     maximum = ", ".join(f"{names[kept[i]]} by {deviation[i]:.1f}" for i in order)
     text = (
         f"{of} contradicts the site: largest deviations {maximum} sigmas; joint chi square"

@@ -66,37 +66,21 @@ class FixState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FixProblem:
-    """Phasors with their weights, and other information; a row for each pose to estimate.
-
-    Parameters
-    ----------
-    time : ndarray, shape (m,)
-    measured : ndarray, shape (m, channels, 6)
-        Real parts, then imaginary parts (T).
-    sqrt_information : ndarray, shape (m, channels, 3, 3)
-        Whitening (1/T); zero where a channel is missing.
-    noise : ndarray, shape (m, channels, 3, 3), optional
-        Covariance of the whitened noise, if the whitening includes more than noise.
-    blocks : tuple of Block
-        Nuisances estimated with the pose.
-    prior : optional
-        Poses with their whitening.
-    channel_rotation : ndarray, shape (m, channels, 3, 3), optional
-        As of `magfusion.model.samples.FieldSamples`.
-    motion : CycleMotion, optional
-        If channels are measured in turn by a moving platform.
-    """
+    """Phasors with their weights, and other information; a row for each pose to estimate."""
 
     calibration: Calibration
-    time: Array
-    measured: Array
-    sqrt_information: Array
+    time: Array  # (m,)
+    measured: Array  # (m, channels, 6), real parts, then imaginary parts (T)
+    sqrt_information: Array  # (m, channels, 3, 3), whitening (1/T); zero where a channel is missing
+    # (m, channels, 3, 3), covariance of the whitened noise, if the whitening includes more than
+    # noise
     noise: Array | None
-    blocks: tuple[Block, ...]
+    blocks: tuple[Block, ...]  # nuisances estimated with the pose
     gravity: Gravity | None
-    prior: PosePrior | None
+    prior: PosePrior | None  # poses with their whitening
+    # (m, channels, 3, 3), as of `magfusion.model.samples.FieldSamples`
     channel_rotation: Array | None = None
-    motion: CycleMotion | None = None
+    motion: CycleMotion | None = None  # if channels are measured in turn by a moving platform
 
     def rows(self, chosen: Chosen) -> "FixProblem":
         """Return selected rows, possibly repeated."""
@@ -168,12 +152,8 @@ class FixEpochs(NamedTuple):
 def nuisance_blocks(site: Site, gain_sigma: float | None = None) -> tuple[Block, ...]:
     """Return the columns of the nuisances estimated with the pose.
 
-    Parameters
-    ----------
-    site : Site
-        The drive phases of its beacons that are not synchronised come first.
-    gain_sigma : float, optional
-        Prior of a log-gain of each beacon; None if gains are known.
+    `site`: the drive phases of its beacons that are not synchronised come first. `gain_sigma`:
+    prior of a log-gain of each beacon; None if gains are known.
     """
     blocks = [
         Block(PHASE, beacon.name, slice(0), np.full(len(beacon.tones), np.inf))
@@ -198,10 +178,7 @@ def epochs_of(
 ) -> Iterator[FixEpochs]:
     """Yield the weighted epochs of a log in chunks.
 
-    Raises
-    ------
-    EstimationError
-        Where there is no epoch.
+    Raises EstimationError where there is no epoch.
     """
     if len(samples) == 0:
         raise EstimationError("no epoch to fix: every window was dropped")

@@ -13,13 +13,7 @@ from magfusion.estimation.snapshot.survey_error import honest_covariance, survey
 from magfusion.estimation.solve.batched import NormalEquations, minimise, open_inverse
 from magfusion.model.field import skew
 from magfusion.model.field_map import block_diagonal
-from magfusion.model.parameters import (
-    GAIN,
-    PHASE,
-    Calibration,
-    Parameter,
-    dimension,
-)
+from magfusion.model.parameters import GAIN, PHASE, Calibration, Parameter, dimension
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -48,26 +42,11 @@ def refine(
 ) -> Fixes:
     """Refine the pose at every epoch from an initial guess.
 
-    It converges to the minimum next to the start; mirrored poses are not searched.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Channels in the site's order.
-    start : Trajectory
-        Poses at the same times.
-    gravity, prior, survey_error, free_parameters, gain_sigma
-        As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
-
-    Returns
-    -------
-    Fixes
-        With one hypothesis.
-
-    Raises
-    ------
-    EstimationError
-        Where there is no epoch.
+    It converges to the minimum next to the start; mirrored poses are not searched. `samples`:
+    channels in the site's order. `start`: poses at the same times. `gravity`, `prior`,
+    `survey_error`, `free_parameters`, `gain_sigma`: as in
+    `magfusion.estimation.snapshot.likelihood.fix_epochs`. Returned with one hypothesis. Raises
+    EstimationError where there is no epoch.
     """
     parts, first = [], 0
     for epochs in epochs_of(
@@ -100,10 +79,7 @@ def joined(parts: list[Fixes]) -> Fixes:
 def as_fixes(problem: FixProblem, solved: RefinedFixes, count: int) -> Fixes:
     """Return rows as fixes of so many hypotheses each, in the given order.
 
-    Parameters
-    ----------
-    problem : FixProblem
-        Every epoch repeated for each of its hypotheses.
+    `problem`: every epoch repeated for each of its hypotheses.
     """
     state = solved.state
     pose_cov, determined = posterior(problem, solved)
@@ -203,12 +179,8 @@ def _normal(problem: FixProblem, state: FixState) -> NormalEquations:
 def rows_at(problem: FixProblem, state: FixState) -> tuple[Array, Array, Array | None]:
     """Return every whitened row at a state, six of each channel, then gravity and prior.
 
-    Returns
-    -------
-    jacobian : ndarray, shape (m, rows, 6 + nuisances)
-    error : ndarray, shape (m, rows)
-    covariance : ndarray, shape (m, rows, rows), optional
-        Of the error, including the survey's, if the whitening only approximates it.
+    Returns `jacobian` (m, rows, 6 + nuisances); `error` (m, rows); `covariance` (m, rows, rows): of
+    the error, including the survey's, if the whitening only approximates it.
     """
     parts = [_columns(problem, state)]
     parts += [np.concatenate([by, e[..., None]], axis=-1) for by, e in _known(problem, state)]
@@ -238,10 +210,7 @@ def _spread(problem: FixProblem, kind: Parameter) -> Array:
 def solved_from(problem: FixProblem, start: FixState) -> RefinedFixes:
     """Move every row to the minimum next to its start.
 
-    Parameters
-    ----------
-    start : FixState
-        Of the same rows.
+    `start`: of the same rows.
     """
     spread = _spread(problem, PHASE), _spread(problem, GAIN)
     count = start.phase.shape[1]

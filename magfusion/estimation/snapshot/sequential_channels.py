@@ -24,13 +24,8 @@ def predicted(problem: FixProblem, state: FixState) -> Array:
 def linearized(problem: FixProblem, state: FixState) -> tuple[Array, Array, Array]:
     """Return the phasors of states, and their derivatives by pose and nuisances.
 
-    Returns
-    -------
-    value : ndarray, shape (m, channels, 6)
-        (T)
-    by_pose : ndarray, shape (m, channels, 6, 6)
-        By rotation and translation in the body's axes.
-    by_nuisance : ndarray, shape (m, channels, 6, nuisances)
+    Returns `value` (m, channels, 6) (T); `by_pose` (m, channels, 6, 6): by rotation and translation
+    in the body's axes; `by_nuisance` (m, channels, 6, nuisances).
     """
     known, blocks, time = problem.at(state), problem.blocks, problem.time
     if not _is_sequential(problem):
@@ -53,10 +48,7 @@ def linearized(problem: FixProblem, state: FixState) -> tuple[Array, Array, Arra
 def by_motion(problem: FixProblem, state: FixState, by_pose: Array) -> Array:
     """Return the effect of one sigma of the motion on the phasors, shape (m, channels, 6, 3).
 
-    Parameters
-    ----------
-    by_pose : ndarray, shape (m, channels, 6, 6)
-        As of `linearized`.
+    `by_pose` (m, channels, 6, 6): as of `linearized`.
     """
     assert problem.motion is not None
     by_place = by_pose[..., 3:] @ np.swapaxes(state.rotation, 1, 2)[:, None]

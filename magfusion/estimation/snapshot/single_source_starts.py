@@ -18,11 +18,10 @@ from magfusion.estimation.snapshot.coil_starts import at_point, middle_of
 from magfusion.estimation.snapshot.problem import FixProblem, FixState
 from magfusion.model.parameters import predict_channels
 from magfusion.model.site import Site
-from magfusion.units import Array, BoolArray, ComplexArray
+from magfusion.units import TINY, Array, BoolArray, ComplexArray
 
 FLAT = 1e-6  # of the largest singular value; coils of which one adds no direction
 REFERENCE = 1.0  # m; distance at which the source is first evaluated
-_TINY = 1e-300
 
 
 def is_single_source(site: Site) -> bool:
@@ -33,15 +32,8 @@ def is_single_source(site: Site) -> bool:
 def starts_about_one(problem: FixProblem) -> tuple[FixState, int]:
     """Return the states that explain epochs of two axes, so many rows an epoch.
 
-    Parameters
-    ----------
-    problem : FixProblem
-        Its whitening is zero where a component is missing.
-
-    Raises
-    ------
-    EstimationError
-        Where the receiver has one axis, or the source's coils span no space.
+    `problem`: its whitening is zero where a component is missing. Raises EstimationError where the
+    receiver has one axis, or the source's coils span no space.
     """
     site = problem.calibration.site
     if len(site.platform.magnetometer.axes) == 1:
@@ -140,7 +132,7 @@ def _signed(
 def _directions(flat: Array) -> list[tuple[Array, float]]:
     """Return the directions from the source, each with ``c/r^3`` of unit moments."""
     value, vector = np.linalg.eigh(flat.T @ flat)
-    size = float(np.sqrt(max(value[0], 1e-12 * value[1], _TINY)))
+    size = float(np.sqrt(max(value[0], 1e-12 * value[1], TINY)))
     along = np.sqrt(4.0 / 3.0 * max(value[1] - value[0], 0.0)) * vector[:, 1]
     within = np.linalg.pinv(flat.T) @ along
     within = within / max(float(np.linalg.norm(within)), 1.0)

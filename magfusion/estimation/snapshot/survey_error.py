@@ -66,15 +66,8 @@ def survey_jacobians(
 def whitened(sqrt_information: Array, columns: Array) -> Array:
     """Return columns of the phasors' rows in units of their sigma.
 
-    Parameters
-    ----------
-    sqrt_information : ndarray, shape (m, channels, 3, 3)
-    columns : ndarray, shape (m, channels, 6, k)
-        Of real parts, then imaginary parts (T).
-
-    Returns
-    -------
-    ndarray, shape (m, rows, k)
+    `sqrt_information` (m, channels, 3, 3). `columns` (m, channels, 6, k): of real parts, then
+    imaginary parts (T). Returns (m, rows, k).
     """
     m, channels, _, width = columns.shape
     halves = columns.reshape(m, channels, 2, 3, width)
@@ -86,18 +79,9 @@ def honest_covariance(
 ) -> Array:
     """Return the covariance of an estimate whose weights only approximate the survey error.
 
-    Parameters
-    ----------
-    by_found, by_survey : ndarray, shape (m, rows, ...)
-        From `survey_jacobians`.
-    noise : ndarray, shape (m, rows, rows)
-        Covariance of the whitened noise.
-    inverse, information : ndarray, shape (m, found, found)
-        Of the normal matrix, which may include gravity or a prior.
-
-    Returns
-    -------
-    ndarray, shape (m, found, found)
+    `by_found`, `by_survey` (m, rows, ...): from `survey_jacobians`. `noise` (m, rows, rows):
+    covariance of the whitened noise. `inverse`, `information` (m, found, found): of the normal
+    matrix, which may include gravity or a prior. Returns (m, found, found).
     """
     transposed = np.swapaxes(by_found, 1, 2)
     spread = transposed @ noise @ by_found + information - transposed @ by_found

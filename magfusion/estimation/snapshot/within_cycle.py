@@ -22,12 +22,8 @@ LONGEST = 1.0  # s; more distant fixes are not used
 def fixed_in_motion(epochs: FixEpochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
     """Repeat fixes with each channel predicted at the platform's position of its measurement.
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (n, hypotheses, 3)
-        World axes (m/s).
-    sigma : ndarray, shape (n, hypotheses)
-        Standard deviation of each component (m/s).
+    `velocity` (n, hypotheses, 3): world axes (m/s). `sigma` (n, hypotheses): standard deviation of
+    each component (m/s).
     """
     ahead = epochs.samples.ahead_or_zero
     n, count = fixes.cost.shape
@@ -57,18 +53,10 @@ def fixed_in_motion(epochs: FixEpochs, fixes: Fixes, velocity: Array, sigma: Arr
 def velocities(fixes: Fixes, site: Site, *, rotated: bool) -> tuple[Array, Array]:
     """Return the velocity of each hypothesis from the nearest ones of neighbouring epochs.
 
-    Parameters
-    ----------
-    rotated : bool
-        Whether phasors are in the axes of their own times: then the velocity is that of the body,
-        else that of its magnetometer with its lever arm.
-
-    Returns
-    -------
-    velocity : ndarray, shape (n, hypotheses, 3)
-        World axes (m/s).
-    sigma : ndarray, shape (n, hypotheses)
-        Standard deviation of each component (m/s); with the usual speed as a prior.
+    `rotated`: whether phasors are in the axes of their own times: then the velocity is that of the
+    body, else that of its magnetometer with its lever arm. Returns `velocity` (n, hypotheses, 3):
+    world axes (m/s); `sigma` (n, hypotheses): standard deviation of each component (m/s); with the
+    usual speed as a prior.
     """
     sensor, motion = site.platform.magnetometer, site.platform.motion
     lever = np.zeros(3) if rotated else sensor.position_body

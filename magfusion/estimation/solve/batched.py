@@ -161,15 +161,8 @@ def moved_poses(pose: Array, step: Array) -> Array:
 def conditioning(jacobian: Array) -> Array:
     """Return the smallest over the largest singular value of Jacobians with unit columns.
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (..., d, n)
-        Of any units.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        From 0 to 1: below `SINGULAR` the residuals do not determine a direction.
+    `jacobian` (..., d, n): of any units. Returns (...): from 0 to 1: below `SINGULAR` the residuals
+    do not determine a direction.
     """
     if jacobian.shape[-2] < jacobian.shape[-1]:
         return np.zeros(jacobian.shape[:-2])
@@ -181,11 +174,7 @@ def conditioning(jacobian: Array) -> Array:
 def by_differences(residual: Callable[[Array], Array], state: Array) -> tuple[Array, Array]:
     """Return residuals (k, d) and their Jacobian (k, d, n) by central differences.
 
-    Parameters
-    ----------
-    residual : callable
-        Takes states (k, n), of size one, and returns residuals (k, d).
-    state : ndarray, shape (k, n)
+    `residual`: takes states (k, n), of size one, and returns residuals (k, d). `state` (k, n).
     """
     n = state.shape[-1]
     sides = state[:, None] + DIFFERENCE * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
@@ -197,11 +186,8 @@ def by_differences(residual: Callable[[Array], Array], state: Array) -> tuple[Ar
 def open_inverse(information: Array) -> tuple[Array, BoolArray]:
     """Return the inverse of information matrices, and whether they determine the pose.
 
-    Unobservable directions get a large variance, not an infinite one.
-
-    Parameters
-    ----------
-    information : ndarray, shape (..., 6 + nuisances, 6 + nuisances)
+    Unobservable directions get a large variance, not an infinite one. `information` (..., 6 +
+    nuisances, 6 + nuisances).
     """
     value, vector = np.linalg.eigh(information)
     largest = value[..., -1:]

@@ -48,16 +48,10 @@ class BorderedProblem(Protocol[S]):
 
 @dataclass(frozen=True, eq=False)
 class Optimised(Generic[S]):
-    """Result of the loop.
-
-    Parameters
-    ----------
-    cost : float
-        Half the sum of squares.
-    """
+    """Result of the loop."""
 
     estimate: S
-    cost: float
+    cost: float  # half the sum of squares
     iterations: int
     converged: bool
 
@@ -67,10 +61,7 @@ def eliminate(
 ) -> gtsam.GaussianBayesTree:
     """Return the Bayes tree of a linear graph: by Cholesky, or by QR where that fails.
 
-    Raises
-    ------
-    RuntimeError
-        From GTSAM, for a singular system.
+    Raises RuntimeError from GTSAM, for a singular system.
     """
     try:
         return graph.eliminateMultifrontal(ordering)
@@ -96,15 +87,8 @@ def eliminate_partial(
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
     """Return the conditionals of some variables, and the Schur complement of the others.
 
-    Parameters
-    ----------
-    orthogonal : bool
-        Use QR directly: the Schur complement is then a square root.
-
-    Raises
-    ------
-    RuntimeError
-        From GTSAM, for a singular system.
+    `orthogonal`: use QR directly: the Schur complement is then a square root. Raises RuntimeError
+    from GTSAM, for a singular system.
     """
     if not orthogonal:
         try:
@@ -127,10 +111,7 @@ def last_marginal(
 ) -> Array:
     """Return the covariance of the last variable of an ordering.
 
-    Parameters
-    ----------
-    tree : gtsam.GaussianBayesTree
-        Of the graph, in this ordering.
+    `tree`: of the graph, in this ordering.
     """
     kept, others = gtsam.Ordering(), gtsam.Ordering()
     kept.push_back(ordering.at(ordering.size() - 1))
@@ -153,19 +134,9 @@ def optimise(
 ) -> Optimised[S]:
     """Minimise the cost by Gauss-Newton steps, damped (Levenberg-Marquardt) where they fail.
 
-    Parameters
-    ----------
-    estimate : object
-        Initial estimate.
-    tolerance : float
-        Relative decrease of the cost that ends the loop.
-    report : callable, optional
-        Takes the iteration and its cost.
-
-    Raises
-    ------
-    EstimationError
-        Where the initial cost is not finite, or the graph cannot be solved.
+    `estimate`: initial estimate. `tolerance`: relative decrease of the cost that ends the loop.
+    `report`: takes the iteration and its cost. Raises EstimationError where the initial cost is not
+    finite, or the graph cannot be solved.
     """
     cost = problem.cost(estimate)
     if not np.isfinite(cost):

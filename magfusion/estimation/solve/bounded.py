@@ -21,25 +21,15 @@ DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems
 
 
 def minimise_bounded(
-    cost: Callable[[Array], float],
-    start: Array,
-    limits: Array,
-    decrease: float = DECREASE,
+    cost: Callable[[Array], float], start: Array, limits: Array, decrease: float = DECREASE
 ) -> Array:
     """Return the minimum of a cost by a quasi-Newton method (SciPy's L-BFGS-B).
 
     Slopes are central differences with a step suited to rounding.  With SciPy's own step, a hundred
-    thousand times smaller, the search ended where rounding let no step decrease the cost.
-
-    Parameters
-    ----------
-    cost : callable
-        Takes an ndarray of shape (n,); smooth over `DIFFERENCE` of each unknown.
-    start : ndarray, shape (n,)
-    limits : ndarray, shape (n, 2)
-        Lower and upper bound of each unknown.
-    decrease : float
-        Of the cost, relative; a step that decreases it by less is the last.
+    thousand times smaller, the search ended where rounding let no step decrease the cost. `cost`:
+    takes an ndarray of shape (n,); smooth over `DIFFERENCE` of each unknown. `start` (n,).
+    `limits` (n, 2): lower and upper bound of each unknown. `decrease`: of the cost, relative; a
+    step that decreases it by less is the last.
     """
     lateral = DIFFERENCE * np.eye(len(start))
 
@@ -62,18 +52,10 @@ def minimise_curved(
 
     Bertsekas, SIAM J. Control Optim. 20, 1982, with the absolute eigenvalues of the curvature, to
     leave saddles.  For hundreds of searches of a few unknowns: SciPy's bookkeeping would take
-    several times as long as the costs, and ours as long as they, so independent searches run in
-    one batch.
-
-    Parameters
-    ----------
-    cost : callable
-        Returns the cost of each search, shape (k,), at an ndarray of shape (k, n).
-    curved : callable
-        Returns gradients, shape (k, n), and curvatures, shape (k, n, n).
-    start : ndarray, shape (k, n)
-    limits : ndarray, shape (n, 2)
-        Lower and upper bound of each unknown.
+    several times as long as the costs, and ours as long as they, so independent searches run in one
+    batch. `cost`: returns the cost of each search, shape (k,), at an ndarray of shape (k, n).
+    `curved`: returns gradients, shape (k, n), and curvatures, shape (k, n, n). `start` (k, n).
+    `limits` (n, 2): lower and upper bound of each unknown.
     """
     low, high = limits.T
     at = np.minimum(np.maximum(start, low), high)
@@ -148,10 +130,7 @@ def minimise_between(
 ) -> tuple[float, float]:
     """Return the minimum of a cost of one bounded unknown, and that cost (Brent's method).
 
-    Parameters
-    ----------
-    tolerance : float
-        Of the unknown.
+    `tolerance`: of the unknown.
     """
     options = {"xatol": tolerance}
     result = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)

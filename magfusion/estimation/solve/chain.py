@@ -15,28 +15,16 @@ STRETCH = 256  # states that are multiplied at once
 
 
 class Chain(NamedTuple):
-    """Normal equations of variants h of a chain of n states of size s with a border of size c.
+    """Normal equations of variants h of a chain of n states of size s with a border of size c."""
 
-    Parameters
-    ----------
-    diagonal : ndarray, shape (h, n, s, s)
-    following : ndarray, shape (h or 1, n - 1, s, s)
-        Between each state and the next.
-    border : ndarray, shape (h, n, s, c)
-        Between each state and the border.
-    corner : ndarray, shape (h, c, c)
-    right : ndarray, shape (h, n, s, r)
-    right_border : ndarray, shape (h, c, r)
-    sides : ndarray, shape (h, n, s, r + c), optional
-        Array whose parts are right sides and border: solving the chain overwrites it.
-    """
-
-    diagonal: Array
-    following: Array
-    border: Array
-    corner: Array
-    right: Array
-    right_border: Array
+    diagonal: Array  # (h, n, s, s)
+    following: Array  # (h or 1, n - 1, s, s), between each state and the next
+    border: Array  # (h, n, s, c), between each state and the border
+    corner: Array  # (h, c, c)
+    right: Array  # (h, n, s, r)
+    right_border: Array  # (h, c, r)
+    # (h, n, s, r + c), array whose parts are right sides and border: solving the chain overwrites
+    # it
     sides: Array | None = None
 
     @staticmethod
@@ -65,14 +53,9 @@ def solve_chain(
 ) -> ChainSolution:
     """Solve every variant; an undetermined one has infinite, NaN or very large results.
 
-    Parameters
-    ----------
-    kept : int
-        Number of leading components of each state whose covariance is returned.
-    known : ndarray, shape (h, n, s, s), optional
-        As `inverses` of the chain, or `ChainSolution.inverse` of it with other right sides.
-    covariance : bool
-        Whether to compute that of the states.
+    `kept`: number of leading components of each state whose covariance is returned.
+    `known` (h, n, s, s): as `inverses` of the chain, or `ChainSolution.inverse` of it with other
+    right sides. `covariance`: whether to compute that of the states.
     """
     n, size = chain.diagonal.shape[1:3]
     # The sweep overwrites the right sides, and the solution overwrites the sweep: in a log of
@@ -120,10 +103,7 @@ def solve_chain(
 def inverses(diagonal: Array, following: Array) -> Array:
     """Return the inverse of the Schur complement of each state, shape (h, n, s, s).
 
-    Parameters
-    ----------
-    diagonal, following : ndarray
-        As of `Chain`.
+    `diagonal`, `following`: as of `Chain`.
     """
     out, count, selected = np.empty_like(diagonal), diagonal.shape[1], np.zeros(1)
     # In units in which all components of a state are about one.

@@ -4,9 +4,9 @@ import gtsam
 import numpy as np
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.solve.batched import MAX_ITERATIONS
 from magfusion.estimation.solve.bordered import Optimised
 
-ITERATIONS = 100
 SHARPER = 1e-3  # of the loop's tolerance: damped steps decrease the cost by less
 
 
@@ -18,20 +18,13 @@ def optimise_natively(
 ) -> Optimised[gtsam.Values]:
     """Minimise the cost of a nonlinear graph.
 
-    Parameters
-    ----------
-    tolerance : float
-        Relative decrease of the cost that ends the loop of `bordered`.
-
-    Raises
-    ------
-    EstimationError
-        Where the initial cost is not finite, or the graph cannot be solved.
+    `tolerance`: relative decrease of the cost that ends the loop of `bordered`. Raises
+    EstimationError where the initial cost is not finite, or the graph cannot be solved.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(SHARPER * tolerance)
     parameters.setAbsoluteErrorTol(SHARPER * tolerance)
-    parameters.setMaxIterations(ITERATIONS)
+    parameters.setMaxIterations(MAX_ITERATIONS)
     if not np.isfinite(graph.error(values)):
         raise EstimationError("the smoother's initial estimate has no finite cost")
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, ordering, parameters)
@@ -41,4 +34,4 @@ def optimise_natively(
         reason = str(failure).strip().splitlines()[0]
         raise EstimationError(f"GTSAM cannot solve the graph ({reason})") from failure
     done = int(optimiser.iterations())
-    return Optimised(result, float(optimiser.error()), done, converged=done < ITERATIONS)
+    return Optimised(result, float(optimiser.error()), done, converged=done < MAX_ITERATIONS)

@@ -7,25 +7,14 @@ from gtsam.symbol_shorthand import B, V, X
 
 
 def nested_dissection(
-    epochs: int,
-    last: int | None,
-    segments: Sequence[tuple[int, int]] = (),
-    own: Sequence[int] = (),
+    epochs: int, last: int | None, segments: Sequence[tuple[int, int]] = (), own: Sequence[int] = ()
 ) -> gtsam.Ordering:
     """Return an elimination order of halves before their separators, the calibration last.
 
     GTSAM's own orderings, and plain time order, are quadratic in the number of epochs once a
-    calibration variable touches all of them.
-
-    Parameters
-    ----------
-    last : int, optional
-        Key of the calibration.
-    segments : sequence of (int, int)
-        First epoch and key of segments that have their own variable; it comes after them, except
-        where it is the last.
-    own : sequence of int
-        Keys that factors of a user's add: before the calibration.
+    calibration variable touches all of them. `last`: key of the calibration. `segments`: first
+    epoch and key of segments that have their own variable; it comes after them, except where it is
+    the last. `own`: keys that factors of a user's add: before the calibration.
     """
     ordering = gtsam.Ordering()
     begins = [begin for begin, _ in segments] or [0]

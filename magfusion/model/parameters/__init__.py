@@ -171,21 +171,10 @@ def choose_blocks(
 ) -> tuple[Block, ...]:
     """Choose the calibration parameters to estimate.
 
-    Parameters
-    ----------
-    site : Site
-        Its sigmas are the priors; a parameter with zero sigma is known and never selected.
-    groups : iterable of str, optional
-        Any of `GROUPS`, or of the given kinds' own.  None selects every parameter whose sigma is
-        not negligible.
-    parameters : iterable of Parameter
-        The kinds that the measurements depend on; those of the Earth field are included only if
-        it is measured.
-
-    Returns
-    -------
-    tuple of Block
-        In the order of the tangent vector.
+    `site`: its sigmas are the priors; a parameter with zero sigma is known and never selected.
+    `groups`: any of `GROUPS`, or of the given kinds' own. None selects every parameter whose sigma
+    is not negligible. `parameters`: the kinds that the measurements depend on; those of the Earth
+    field are included only if it is measured. Returned in the order of the tangent vector.
     """
     wanted, kinds = None if groups is None else set(groups), tuple(parameters)
     known = dict.fromkeys([*GROUPS, *(kind.group for kind in kinds)])

@@ -119,10 +119,7 @@ class _LogMoment(BeaconParameter, SiteParameter):
 def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
     """Return the site with scaled moments of some beacons, as an estimator does at every step.
 
-    Parameters
-    ----------
-    moments_beacon : mapping of str to ndarray, shape (coils, 3)
-        By beacon name, in the same direction (A m^2).
+    `moments_beacon` (coils, 3) each: by beacon name, in the same direction (A m^2).
     """
     beacons = tuple(
         _changed(beacon, moments_beacon[beacon.name]) if beacon.name in moments_beacon else beacon

@@ -75,9 +75,7 @@ def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
 def stretches(site: Site, detected: BoolArray) -> Iterator[tuple[slice, IntArray]]:
     """Yield successive epochs, with the beacons detected at any of them.
 
-    Parameters
-    ----------
-    detected : bool ndarray, shape (n, channels)
+    `detected` (n, channels).
     """
     for begin in range(0, len(detected), TOGETHER):
         rows = slice(begin, begin + TOGETHER)

@@ -21,27 +21,14 @@ WAVES = 128  # wave numbers in the sum of the response along a tube
 
 @dataclass(frozen=True)
 class Casing:
-    """A long steel tube around the magnetometer, along the body's first axis.
+    """A long steel tube around the magnetometer, along the body's first axis."""
 
-    Parameters
-    ----------
-    radius : float
-        Mean radius of its wall (m).
-    wall : float
-        Thickness (m).
-    permeability : float
-        Relative.
-    conductivity : float
-        (S/m)
-    log_gain_sigma, phase_sigma : float
-        Of the transmission about the value that follows from these: of the logarithm of its
-        magnitude, and of its phase (rad); equal across and along.
-    """
-
-    radius: float
-    wall: float
-    permeability: float = 100.0
-    conductivity: float = 5e6
+    radius: float  # mean radius of its wall (m)
+    wall: float  # thickness (m)
+    permeability: float = 100.0  # relative
+    conductivity: float = 5e6  # (S/m)
+    # log_gain_sigma, phase_sigma: of the transmission about the value that follows from these: of
+    # the logarithm of its magnitude, and of its phase (rad); equal across and along
     log_gain_sigma: float = 0.3
     phase_sigma: float = 0.3
     wall_sigma: float = 0.0
@@ -71,14 +58,10 @@ class Response(NamedTuple):
 def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Response:
     """Return the transmission and flux collection of a tube.
 
-    With ``g = (1 + j) / skin depth`` and ``K = g radius / permeability``: along
-    ``1 / (cosh g d + K sinh(g d) / 2)``, across ``1 / (cosh g d + (K + 1 / K) sinh(g d) / 2)``,
-    d the wall; of a steady field across ``1 / (1 + permeability d / (2 radius))``.
-
-    Parameters
-    ----------
-    change : ndarray, shape (k, 3)
-        Of the logarithms of `STEEL`.
+    With ``g = (1 + j) / skin depth`` and ``K = g radius / permeability``: along ``1 / (cosh g d + K
+    sinh(g d) / 2)``, across ``1 / (cosh g d + (K + 1 / K) sinh(g d) / 2)``, d the wall; of a steady
+    field across ``1 / (1 + permeability d / (2 radius))``. `change` (k, 3): of the logarithms of
+    `STEEL`.
     """
     wall, permeability, conductivity = (
         np.exp(np.clip(change, -MAX_LOG_ERROR, MAX_LOG_ERROR))
@@ -118,21 +101,12 @@ def gathering_weights(
     """Return the field a long tube adds along its axis, as weights of the field outside it.
 
     An axially magnetised wall has poles where its magnetisation changes, and their field magnetises
-    it again.  To a wave of number q along the tube the response of a ring of poles is
-    ``-N / (1 + N)``, with ``N = strength q^2 K0(q radius)``, to all orders, as the tube is
-    translation invariant.  Positions must be closer than the field changes: a dipole's at a
-    distance d has no waves shorter than about d.
-
-    Parameters
-    ----------
-    strength : complex ndarray, shape (k,)
-        Of `Response` (m^2).
-    place : ndarray, shape (m,)
-        Positions at equal steps along the tube, relative to the sensor (m).
-
-    Returns
-    -------
-    weights, by_log_strength : complex ndarray, shape (k, m)
+    it again.  To a wave of number q along the tube the response of a ring of poles is ``-N / (1 +
+    N)``, with ``N = strength q^2 K0(q radius)``, to all orders, as the tube is translation
+    invariant.  Positions must be closer than the field changes: a dipole's at a distance d has no
+    waves shorter than about d. `strength` (k,): of `Response` (m^2). `place` (m,): positions at
+    equal steps along the tube, relative to the sensor (m). Returns `weights`,
+    `by_log_strength` (k, m).
     """
     separate = float(place[1] - place[0])
     node, share = leggauss(WAVES)

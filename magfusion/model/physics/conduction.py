@@ -17,11 +17,7 @@ from magfusion.units import MU0, MU0_OVER_4PI, Array, ComplexArray
 def skin_depth(frequency_hz: Array | float, conductivity: float) -> Array:
     """Return the distance over which a wave decays by e (m); infinite without conduction.
 
-    Parameters
-    ----------
-    frequency_hz : ndarray or float
-    conductivity : float
-        (S/m)
+    `conductivity` (S/m).
     """
     rate = np.pi * MU0 * conductivity * np.asarray(frequency_hz, dtype=np.float64)
     with np.errstate(divide="ignore"):
@@ -36,19 +32,8 @@ def decay(frequency_hz: Array, conductivity: float) -> ComplexArray:
 def conducted_field(offset: Array, moment: Array, decay: ComplexArray) -> ComplexArray:
     """Return the contribution of conduction to the phasor of a dipole.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (..., 3)
-        From the dipole (m). Must not be zero.
-    moment : ndarray, shape (..., 3)
-        Peak (A m^2); its phase is that of the phasor's time.
-    decay : complex ndarray, shape (...)
-        As of `decay` (1/m).
-
-    Returns
-    -------
-    complex ndarray, shape (..., 3)
-        (T)
+    `offset` (..., 3): from the dipole (m). Must not be zero. `moment` (..., 3): peak (A m^2); its
+    phase is that of the phasor's time. `decay` (...): as of `decay` (1/m). Returns (..., 3) (T).
     """
     square, along, f, g = _terms(offset, moment, decay)
     radial = (3.0 * f + g) / square
@@ -58,10 +43,7 @@ def conducted_field(offset: Array, moment: Array, decay: ComplexArray) -> Comple
 def conducted_gradient(offset: Array, moment: Array, decay: ComplexArray) -> ComplexArray:
     """Return the gradient of `conducted_field`: ``[i, j] = d field_i / d offset_j``.
 
-    Returns
-    -------
-    complex ndarray, shape (..., 3, 3)
-        (T/m); without trace, but not symmetric: a current flows.
+    Returns (..., 3, 3) (T/m); without trace, but not symmetric: a current flows.
     """
     square, along, f, g = _terms(offset, moment, decay)
     x = decay[..., None] * np.sqrt(square)

@@ -31,17 +31,9 @@ def dipole_field(offset: Array, moment: Array) -> Array:
 def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Array]:
     """Return the dipole field and its gradient: ``[i, j] = d field_i / d offset_j``.
 
-    Parameters
-    ----------
-    offset, moment : ndarray, shape (..., 3)
-        As in `dipole_field` (m, A m^2).
-
-    Returns
-    -------
-    field : ndarray, shape (..., 3)
-        (T)
-    gradient : ndarray, shape (..., 3, 3)
-        (T/m); symmetric and trace-free, as the field has neither curl nor divergence.
+    `offset`, `moment` (..., 3): as in `dipole_field` (m, A m^2). Returns `field` (..., 3) (T);
+    `gradient` (..., 3, 3) (T/m); symmetric and trace-free, as the field has neither curl nor
+    divergence.
     """
     square = np.einsum("...i,...i", offset, offset)[..., None]
     along = np.einsum("...i,...i", offset, moment)[..., None]
@@ -58,17 +50,8 @@ def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Arra
 def dipole_field_along(offset: Array, moment: Array, along: Array) -> Array:
     """Return the derivative of the dipole field along displacements, without its full gradient.
 
-    Parameters
-    ----------
-    offset, moment : ndarray, shape (..., 3)
-        As in `dipole_field` (m, A m^2).
-    along : ndarray, shape (..., 3)
-        Of the point, or its velocity (m, m/s).
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        (T, T/s)
+    `offset`, `moment` (..., 3): as in `dipole_field` (m, A m^2). `along` (..., 3): of the point, or
+    its velocity (m, m/s). Returns (..., 3) (T, T/s).
     """
     square = np.einsum("...i,...i", offset, offset)[..., None]
     by_moment = np.einsum("...i,...i", offset, moment)[..., None]

@@ -32,25 +32,11 @@ def sphere_polarizability(
     """Return the complex moment that unit flux density induces in a sphere.
 
     With ``x = a sqrt(-i w mu sigma)`` and ``q = x j0(x) / j1(x) - 1`` (spherical Bessel functions)
-    it is ``(4 pi a^3 / mu0) (2 mu_r - q) / (2 (mu_r + q))``: ``(4 pi a^3 / mu0) (mu_r - 1) /
-    (mu_r + 2)`` in a static field, where q is 2, and ``-2 pi a^3 / mu0`` for a thin skin.
-
-    Parameters
-    ----------
-    radius : ndarray or float
-        (m)
-    permeability : ndarray or float
-        Relative, 1 for no iron.
-    conductivity : ndarray or float
-        (S/m)
-    angular_frequency : ndarray or float
-        (rad/s)
-
-    Returns
-    -------
-    complex ndarray
-        (A m^2/T), of the arguments' common shape, for phasors of ``exp(+i w t)``; its imaginary
-        part is never positive, as the sphere takes power from the field.
+    it is ``(4 pi a^3 / mu0) (2 mu_r - q) / (2 (mu_r + q))``: ``(4 pi a^3 / mu0) (mu_r - 1) / (mu_r
+    + 2)`` in a static field, where q is 2, and ``-2 pi a^3 / mu0`` for a thin skin. `radius` (m).
+    `permeability`: relative, 1 for no iron. `conductivity` (S/m), `angular_frequency` (rad/s).
+    Returns (A m^2/T), of the arguments' common shape, for phasors of ``exp(+i w t)``; its imaginary
+    part is never positive, as the sphere takes power from the field.
     """
     a, mu = np.asarray(radius, dtype=np.float64), np.asarray(permeability, dtype=np.float64)
     square = -1j * np.asarray(angular_frequency) * MU0 * mu * np.asarray(conductivity) * a**2
@@ -74,25 +60,11 @@ def induced_field(
 ) -> ComplexArray:
     """Return the field of induced dipoles, in the axes of the arguments.
 
-    Each body is a dipole in the primary field at its centre: exact for a sphere in a uniform
-    field.  The gradient of the primary over the body, and mutual induction of bodies, are
-    neglected.
-
-    Parameters
-    ----------
-    point : ndarray, shape (n, 3)
-        Outside every body (m).
-    centre : ndarray, shape (bodies, 3)
-        (m)
-    polarizability : complex ndarray, shape (bodies, tones)
-        (A m^2/T)
-    primary : complex ndarray, shape (bodies, tones, 3)
-        Field at the centres (T).
-
-    Returns
-    -------
-    complex ndarray, shape (n, tones, 3)
-        (T)
+    Each body is a dipole in the primary field at its centre: exact for a sphere in a uniform field.
+    The gradient of the primary over the body, and mutual induction of bodies, are neglected.
+    `point` (n, 3): outside every body (m). `centre` (bodies, 3) (m),
+    `polarizability` (bodies, tones) (A m^2/T). `primary` (bodies, tones, 3): field at the centres
+    (T). Returns (n, tones, 3) (T).
     """
     field = np.zeros((len(point), *primary.shape[1:]), dtype=np.complex128)
     for place, moment in zip(centre, polarizability[..., None] * primary, strict=True):

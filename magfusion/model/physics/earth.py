@@ -26,24 +26,9 @@ def earth_field_world(
 ) -> Array:
     """Return the geomagnetic main field of the IGRF.
 
-    Parameters
-    ----------
-    latitude_deg, longitude_deg : float
-        Geodetic (WGS84), north and east positive.
-    height_m : float
-        Above the ellipsoid.
-    date : datetime.date
-        From 1900-01-01 to 2030-01-01.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Flux density (T), axes east, north, up.
-
-    Raises
-    ------
-    InputError
-        If the place is not on the Earth or the date is outside the IGRF.
+    `latitude_deg`, `longitude_deg`: geodetic (WGS84), north and east positive. `height_m`: above
+    the ellipsoid. `date`: from 1900-01-01 to 2030-01-01. Returns (3,): flux density (T), axes east,
+    north, up. Raises InputError if the place is not on the Earth or the date is outside the IGRF.
     """
     _check_place(latitude_deg, height_m)
     if not -360.0 <= longitude_deg <= 360.0:
@@ -66,22 +51,8 @@ def earth_field_world(
 def gravity(latitude_deg: float, height_m: float) -> float:
     """Return normal gravity on WGS84: Somigliana's formula and the free-air term.
 
-    Parameters
-    ----------
-    latitude_deg : float
-        Geodetic.
-    height_m : float
-        Above the ellipsoid.
-
-    Returns
-    -------
-    float
-        (m/s^2); NIMA TR8350.2 (third edition), Eq 4-1 and 4-3.
-
-    Raises
-    ------
-    InputError
-        If the place is not on the Earth.
+    `latitude_deg`: geodetic. `height_m`: above the ellipsoid. Returns (m/s^2); NIMA TR8350.2 (third
+    edition), Eq 4-1 and 4-3. Raises InputError if the place is not on the Earth.
     """
     _check_place(latitude_deg, height_m)
     sine2 = np.sin(latitude_deg * DEGREE) ** 2
@@ -92,19 +63,12 @@ def gravity(latitude_deg: float, height_m: float) -> float:
 
 
 def east_north_up(
-    latitude_deg: float,
-    longitude_deg: float,
-    height_m: float,
-    origin: tuple[float, float, float],
+    latitude_deg: float, longitude_deg: float, height_m: float, origin: tuple[float, float, float]
 ) -> Array:
     """Return a position in the tangent plane of an origin, shape (3,) (m).
 
-    Parameters
-    ----------
-    latitude_deg, longitude_deg, height_m : float
-        On and above the ellipsoid WGS84.
-    origin : tuple of float
-        The same of the world's origin.
+    `latitude_deg`, `longitude_deg`, `height_m`: on and above the ellipsoid WGS84. `origin`: the
+    same of the world's origin.
     """
     latitude, longitude = origin[0] * DEGREE, origin[1] * DEGREE
     away = _earth_fixed(latitude_deg, longitude_deg, height_m) - _earth_fixed(*origin)

@@ -71,10 +71,7 @@ def coil_kappa(radius: float | None, length: float | None) -> float:
 def coil_shape(kappa: float, length: float | None = None) -> tuple[float | None, float | None]:
     """Return radius and length (m) of a coil with a constant; None for none.
 
-    Parameters
-    ----------
-    length : float, optional
-        Known length; changed only if no radius fits it.
+    `length`: known length; changed only if no radius fits it.
     """
     square = 8.0 * kappa + (length or 0.0) ** 2 / 3.0
     if square >= 0.0:
@@ -84,23 +81,14 @@ def coil_shape(kappa: float, length: float | None = None) -> tuple[float | None,
 
 @dataclass(frozen=True, eq=False)
 class CoilCoupling:
-    """Flux density that a coil receives from another, with its derivatives.
+    """Flux density that a coil receives from another, with its derivatives."""
 
-    Parameters
-    ----------
-    value : ndarray, shape (...)
-        (T) for a moment in A m^2 and a sensitivity without unit.
-    by_offset, by_moment, by_sensitivity : ndarray, shape (..., 3)
-    by_kappa_moment, by_kappa_sensitivity : ndarray, shape (...)
-        (T/m^2)
-    """
-
-    value: Array
-    by_offset: Array
-    by_moment: Array
-    by_sensitivity: Array
-    by_kappa_moment: Array
-    by_kappa_sensitivity: Array
+    value: Array  # (...) (T), for a moment in A m^2 and a sensitivity without unit
+    by_offset: Array  # (..., 3)
+    by_moment: Array  # (..., 3)
+    by_sensitivity: Array  # (..., 3)
+    by_kappa_moment: Array  # (...) (T/m^2)
+    by_kappa_sensitivity: Array  # (...) (T/m^2)
 
 
 def coil_coupling(
@@ -113,17 +101,11 @@ def coil_coupling(
     """Return the coupling from a transmitting to a receiving coil, all in the same axes.
 
     ``s . (1 - kappa_s (n_s . grad)^2) (1 - kappa_m (n_m . grad)^2) G(offset) m``, with G the field
-    of a unit dipole.
-
-    Parameters
-    ----------
-    offset : ndarray, shape (..., 3)
-        From the centre of the transmitting coil to that of the receiving one (m).
-    moment, sensitivity : ndarray, shape (..., 3)
-        Along the coils' axes (A m^2; without unit).  Must not be zero.
-    kappa_moment, kappa_sensitivity : ndarray, shape (...), optional
-        `disc_kappa` or `square_kappa` of the coils (m^2); with neither both are points, and the
-        derivatives by them are zero.
+    of a unit dipole. `offset` (..., 3): from the centre of the transmitting coil to that of the
+    receiving one (m). `moment`, `sensitivity` (..., 3): along the coils' axes (A m^2; without
+    unit). Must not be zero. `kappa_moment`, `kappa_sensitivity` (...): `disc_kappa` or
+    `square_kappa` of the coils (m^2); with neither both are points, and the derivatives by them are
+    zero.
     """
     size_s, size_m = (np.linalg.norm(v, axis=-1) for v in (sensitivity, moment))
     along_s, along_m = sensitivity / size_s[..., None], moment / size_m[..., None]

@@ -16,10 +16,8 @@ WIRE_MEAN_DISTANCE = float(np.exp(-0.25))  # of points of a disc from each other
 def circle_mutual(first: Array, second: Array, height: Array) -> Array:
     """Return the mutual inductance of coaxial circular filaments (H).
 
-    Parameters
-    ----------
-    first, second, height : ndarray, shape (n,)
-        Radii, and distance of their planes (m).  Filaments must not coincide.
+    `first`, `second`, `height` (n,): radii, and distance of their planes (m). Filaments must not
+    coincide.
     """
     square = 4.0 * first * second / ((first + second) ** 2 + height**2)
     k = np.sqrt(square)
@@ -30,10 +28,8 @@ def circle_mutual(first: Array, second: Array, height: Array) -> Array:
 def square_mutual(first: Array, second: Array, height: Array) -> Array:
     """Return the mutual inductance of coaxial square filaments with parallel sides (H).
 
-    Parameters
-    ----------
-    first, second, height : ndarray, shape (n,)
-        Half of their sides, and distance of their planes (m).  Filaments must not coincide.
+    `first`, `second`, `height` (n,): half of their sides, and distance of their planes (m).
+    Filaments must not coincide.
     """
     longer, shorter = first + second, first - second
     same, opposite = np.hypot(shorter, height), np.hypot(longer, height)

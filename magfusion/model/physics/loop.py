@@ -20,11 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.units import MU0_OVER_4PI, Array
+from magfusion.units import MU0_OVER_4PI, TINY, Array
 
 _MOST_MEANS = 10  # iterations, each of which doubles the digits; needed at the wire
 _WIRE = 1e-6  # of the radius, about; half the wire's thickness, so that the field stays finite
-_TINY = 1e-300
 
 
 class _Loop(NamedTuple):
@@ -45,20 +44,10 @@ class _Loop(NamedTuple):
 def loop_field(offset: Array, moment: Array, radius: Array | float) -> Array:
     """Return the flux density of thin circular loops, in the axes of the arguments.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (..., 3)
-        From the loop's centre (m).  Must not be zero where the radius is.  The wire has a
-        thickness of a millionth of the radius, so that the field is finite.
-    moment : ndarray, shape (..., 3)
-        Along the loop's axis (A m^2).  Must not be zero.
-    radius : ndarray or float, shape (...)
-        (m); zero for a dipole.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        (T)
+    `offset` (..., 3): from the loop's centre (m). Must not be zero where the radius is. The wire
+    has a thickness of a millionth of the radius, so that the field is finite. `moment` (..., 3):
+    along the loop's axis (A m^2). Must not be zero. `radius` (...) (m); zero for a dipole. Returns
+    (..., 3) (T).
     """
     return _field(_loop(offset, moment, np.asarray(radius, dtype=np.float64)))
 
@@ -68,18 +57,9 @@ def loop_field_and_gradient(
 ) -> tuple[Array, Array]:
     """Return the field of thin circular loops and its gradient, in one evaluation.
 
-    Parameters
-    ----------
-    offset, moment, radius
-        As in `loop_field`.
-
-    Returns
-    -------
-    field : ndarray, shape (..., 3)
-        (T)
-    gradient : ndarray, shape (..., 3, 3)
-        ``[i, j] = d field_i / d offset_j`` (T/m); symmetric and trace-free, as the field has
-        neither curl nor divergence.
+    `offset`, `moment`, `radius`: as in `loop_field`. Returns `field` (..., 3) (T);
+    `gradient` (..., 3, 3): ``[i, j] = d field_i / d offset_j`` (T/m); symmetric and trace-free, as
+    the field has neither curl nor divergence.
     """
     seen = _loop(offset, moment, np.asarray(radius, dtype=np.float64))
     z, s, fall = seen.along, seen.square, (seen.first + 4.0 * seen.third) / seen.reach
@@ -88,7 +68,7 @@ def loop_field_and_gradient(
     axis, across = seen.axis, seen.across
     mixed = axis[..., :, None] * across[..., None, :]
     # Where rounding loses the distance from the axis, the numerators vanish with it.
-    outward = (by_axial + 2.0 * seen.radial) / np.maximum(s, _TINY)
+    outward = (by_axial + 2.0 * seen.radial) / np.maximum(s, TINY)
     gradient = (by_axial - seen.radial)[..., None] * axis[..., :, None] * axis[..., None, :]
     gradient += shear[..., None] * (mixed + np.swapaxes(mixed, -1, -2))
     gradient -= outward[..., None] * across[..., :, None] * across[..., None, :]
@@ -138,14 +118,9 @@ def _loop(offset: Array, moment: Array, radius: Array) -> _Loop:
 def _integrals(parameter: Array, complement: Array) -> tuple[Array, Array]:
     """Return the complete elliptic integrals B and D of a parameter.
 
-    The integrals of ``cos^2`` and of ``sin^2`` over ``sqrt(1 - parameter sin^2)``.
-
-    Parameters
-    ----------
-    parameter : ndarray
-        The square of the modulus, from 0 to 1.
-    complement : ndarray
-        ``sqrt(1 - parameter)``, more accurate from the caller.
+    The integrals of ``cos^2`` and of ``sin^2`` over ``sqrt(1 - parameter sin^2)``. `parameter`: the
+    square of the modulus, from 0 to 1. `complement`: ``sqrt(1 - parameter)``, more accurate from
+    the caller.
     """
     mean, other = 0.5 * (1.0 + complement), np.sqrt(complement)
     separate = 0.5 * parameter / (1.0 + complement)  # half the difference of the previous means

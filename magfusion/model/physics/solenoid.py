@@ -18,24 +18,11 @@ def solenoid_field(
 ) -> Array:
     """Return the flux density of a coil, in the axes of its arguments.
 
-    A coil with a radius is a thin loop, one with a length as well a uniform current sheet, one
-    with a length alone a line of dipoles, one with neither a dipole.  Sheets
-    are integrated at 16 Gauss-Legendre slices: the relative error is below 1e-10 farther off the
-    axis than half a length.
-
-    Parameters
-    ----------
-    offset : ndarray, shape (n, 3)
-        From the coil's centre (m).
-    moment : ndarray, shape (3,)
-        Of the whole coil, along its axis (A m^2).
-    radius, length : float, optional
-        (m)
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        (T)
+    A coil with a radius is a thin loop, one with a length as well a uniform current sheet, one with
+    a length alone a line of dipoles, one with neither a dipole.  Sheets are integrated at 16
+    Gauss-Legendre slices: the relative error is below 1e-10 farther off the axis than half a
+    length. `offset` (n, 3): from the coil's centre (m). `moment` (3,): of the whole coil, along its
+    axis (A m^2). `radius`, `length` (m). Returns (n, 3) (T).
     """
     size = float(np.linalg.norm(moment))
     if size == 0.0:
@@ -57,21 +44,8 @@ def loop_field(offset: Array, moment: Array, radius: float) -> Array:
 
     The sum over wire elements converges as a geometric series on a circle.  Their number gives
     eleven digits at the nearest point, unless it is closer to the wire than a hundredth of the
-    radius.
-
-    Parameters
-    ----------
-    offset : ndarray, shape (n, 3)
-        From the loop's centre (m).
-    moment : ndarray, shape (3,)
-        Along the loop's axis (A m^2). Must not be zero.
-    radius : float
-        (m)
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        (T)
+    radius. `offset` (n, 3): from the loop's centre (m). `moment` (3,): along the loop's axis (A
+    m^2). Must not be zero. `radius` (m). Returns (n, 3) (T).
     """
     size = float(np.linalg.norm(moment))
     current = size / (np.pi * radius**2)

@@ -19,28 +19,15 @@ from magfusion.units import Array
 
 @dataclass(frozen=True)
 class Winding:
-    """A cylindrical coil of round wire, wound in whole layers.
+    """A cylindrical coil of round wire, wound in whole layers."""
 
-    Parameters
-    ----------
-    current : float
-        Peak, of one turn (A).
-    layers, rows : int
-        Concentric layers, and adjacent turns of each.
-    inner_radius : float
-        Radius of the former below the first layer (m).
-    wire : float
-        Diameter with insulation (m); the radial distance of successive layers.
-    pitch : float
-        From turn to turn along the axis (m); the wire's diameter if closely wound.
-    """
-
-    current: float
+    current: float  # peak, of one turn (A)
+    # layers, rows: concentric layers, and adjacent turns of each
     layers: int
     rows: int
-    inner_radius: float
-    wire: float
-    pitch: float
+    inner_radius: float  # radius of the former below the first layer (m)
+    wire: float  # diameter with insulation (m); the radial distance of successive layers
+    pitch: float  # from turn to turn along the axis (m); the wire's diameter if closely wound
 
     @property
     def radii(self) -> Array:

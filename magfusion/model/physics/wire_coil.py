@@ -20,28 +20,14 @@ BOLTZMANN = 1.380649e-23  # J/K
 
 @dataclass(frozen=True)
 class WireCoil:
-    """A coil of copper wire in layers on a former.
-
-    Parameters
-    ----------
-    shape : {"circle", "square"}
-    inner_size : float
-        Radius of the former, or half of its side (m).
-    turns : int
-    layers : int
-        Concentric ones, all equally full.
-    wire : float
-        Diameter of the copper (m).
-    insulated : float
-        Diameter with insulation, the distance of turns and layers (m).
-    """
+    """A coil of copper wire in layers on a former."""
 
     shape: Literal["circle", "square"]
-    inner_size: float
+    inner_size: float  # radius of the former, or half of its side (m)
     turns: int
-    layers: int
-    wire: float
-    insulated: float
+    layers: int  # concentric ones, all equally full
+    wire: float  # diameter of the copper (m)
+    insulated: float  # diameter with insulation, the distance of turns and layers (m)
 
     @property
     def rows(self) -> int:
@@ -126,20 +112,12 @@ class WireCoil:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """A coil that is driven, when its temperature no longer rises.
+    """A coil that is driven, when its temperature no longer rises."""
 
-    Parameters
-    ----------
-    current, voltage : float
-        Peak, at its terminals or those of coil and capacitor (A, V).
-    power : float
-        Mean (W).
-    temperature_degc : float
-    """
-
+    # current, voltage: peak, at its terminals or those of coil and capacitor (A, V)
     current: float
     voltage: float
-    power: float
+    power: float  # mean (W)
     temperature_degc: float
 
 
@@ -159,14 +137,8 @@ def operating_point(
 ) -> OperatingPoint | None:
     """Return the equilibrium of a coil in still air; None if it has none below 300 degC.
 
-    Parameters
-    ----------
-    current, voltage : float, optional
-        Peak (A, V), one of the two.
-    frequency_hz : float
-        Zero for direct current.
-    tuned : bool
-        Whether `resonance_capacitance` is in series with it.
+    `current`, `voltage`: peak (A, V), one of the two. `frequency_hz`: zero for direct current.
+    `tuned`: whether `resonance_capacitance` is in series with it.
     """
     reactance = 0.0 if tuned else 2.0 * np.pi * frequency_hz * coil.inductance
     mean = 0.5 if frequency_hz else 1.0

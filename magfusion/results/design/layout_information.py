@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.estimation.posterior.protection_levels import protection_levels
-from magfusion.estimation.posterior.separation import Separation
+from magfusion.estimation.posterior.separation import POSE, Separation
 from magfusion.model.parameters import (
     BeaconParameter,
     Block,
@@ -33,7 +33,6 @@ from magfusion.results.pose_information import (
 )
 from magfusion.units import Array
 
-POSE = 6
 NOTHING = 1e-24  # information (1/m^2, 1/rad^2) below which there is none
 FLOOR = 1e-14  # of each number's own information: keeps what is open finite, and very large
 

@@ -233,12 +233,7 @@ class Arrivals(ABC):
     def gathered(self, delay: float, span: float) -> float | None:
         """Return until when to search for a first state (s); None as long as that is too early.
 
-        Parameters
-        ----------
-        delay : float
-            As of `receive` (s).
-        span : float
-            Required duration of data (s).
+        `delay`: as of `receive` (s). `span`: required duration of data (s).
         """
 
     @abstractmethod
@@ -283,10 +278,7 @@ class Arrivals(ABC):
     def next_window(self, state: State, needs_separate: Callable[[State], bool]) -> float | None:
         """Advance to the next admitted window; return its centre (s), None for none.
 
-        Parameters
-        ----------
-        needs_separate : callable
-            Returns whether close tones must first be separated at a state.
+        `needs_separate`: returns whether close tones must first be separated at a state.
         """
 
     @abstractmethod

@@ -23,27 +23,14 @@ from magfusion.units import ComplexArray
 
 @dataclass(frozen=True, eq=False)
 class EpochMeasurements:
-    """Measurements of one epoch.
+    """Measurements of one epoch."""
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Without undetected beacons; as predicted where tones are only measured jointly.
-    phasors : FieldPhasors or JointPhasors
-        The phasors as a measurement.
-    earth : EarthField, optional
-        The static field as a measurement, if it is one.
-    steady : SteadyFields, optional
-        The measured static field, where there is a waveform.
-    repeats : float
-        Number of epochs that contain each sample of overlapping windows.
-    """
-
+    # without undetected beacons; as predicted where tones are only measured jointly
     samples: FieldSamples
-    phasors: FieldPhasors | JointPhasors
-    earth: EarthField | None
-    steady: SteadyFields | None
-    repeats: float
+    phasors: FieldPhasors | JointPhasors  # the phasors as a measurement
+    earth: EarthField | None  # the static field as a measurement, if it is one
+    steady: SteadyFields | None  # the measured static field, where there is a waveform
+    repeats: float  # number of epochs that contain each sample of overlapping windows
 
     @property
     def is_sequential(self) -> bool:

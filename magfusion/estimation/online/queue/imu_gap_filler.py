@@ -16,12 +16,8 @@ REACH = 0.5  # s; of inertial samples about a stretch, to detect a gap
 class ImuGapFiller:
     """Motion measured by the magnetometer in the gaps of the inertial stream.
 
-    Attributes
-    ----------
-    time : ndarray, shape (n,)
-        On the IMU's clock (s).
-    rows : ndarray, shape (n, 6)
-        Rates and specific forces of the body (rad/s, m/s^2).
+    `time` (n,): on the IMU's clock (s). `rows` (n, 6): rates and specific forces of the body
+    (rad/s, m/s^2).
     """
 
     time: Array
@@ -41,14 +37,7 @@ class ImuGapFiller:
     ) -> None:
         """Estimate the motion from a state on, where the inertial stream has a gap.
 
-        Parameters
-        ----------
-        state : State
-            The last known one.
-        until : float
-            (s)
-        offset : float
-            Added to the IMU's stamps (s).
+        `state`: the last known one. `until` (s). `offset`: added to the IMU's stamps (s).
         """
         stamps, detected = imu.between(state.time - offset - REACH, until - offset + REACH)
         begin, end = silences(stamps + offset, admission.imu_step, admission.imu_margin)

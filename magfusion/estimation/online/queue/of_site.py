@@ -10,10 +10,7 @@ from magfusion.receiver.windows import LockinSettings
 def arrivals_of(site: Site, lockin: LockinSettings | None, *, short: bool) -> Arrivals:
     """Return the input queue of a site's platform.
 
-    Parameters
-    ----------
-    short : bool
-        Whether close tones are measured together, in short windows, by one magnetometer.
+    `short`: whether close tones are measured together, in short windows, by one magnetometer.
     """
     if site.platform.further:
         return SeveralArrivals(site, lockin)

@@ -18,10 +18,7 @@ from magfusion.model.aiding import AidingSamples, AidingSensor
 class OtherMeasurements:
     """Measurements that are not processed yet, sorted by time.
 
-    Attributes
-    ----------
-    waiting : list of (float, Measurement)
-        With their times (s).
+    `waiting`: with their times (s).
     """
 
     waiting: list[tuple[float, Measurement]]
@@ -38,15 +35,7 @@ class OtherMeasurements:
     def add(self, time: float, measurement: Measurement, after: float, newest: float) -> bool:
         """Add a measurement; return whether it is after a time (s).
 
-        Parameters
-        ----------
-        newest : float
-            Newest stamp of all streams (s).
-
-        Raises
-        ------
-        InputError
-            If the clock jumped.
+        `newest`: newest stamp of all streams (s). Raises InputError if the clock jumped.
         """
         check_clock("measurement", np.array([time]), newest)
         in_time = time > after + SAME_TIME

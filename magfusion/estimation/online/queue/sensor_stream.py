@@ -140,10 +140,8 @@ class SensorStream:
     ) -> MotionCompensated:
         """Return the window at a prediction, by the calibration of this magnetometer.
 
-        Parameters
-        ----------
-        before, predicted, imu, offset, blind, is_lost
-            As of `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
+        `before`, `predicted`, `imu`, `offset`, `blind`, `is_lost`: as of
+        `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
         """
         receiver = self.receiver
         assert isinstance(receiver, LockinReceiver)

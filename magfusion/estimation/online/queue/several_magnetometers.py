@@ -38,10 +38,7 @@ SILENCE = 1.0  # s; plus a window: the others do not wait for one that is silent
 class SeveralArrivals(Arrivals):
     """Streams of a platform with several magnetometers.
 
-    Attributes
-    ----------
-    begun_at : float
-        First stamp of any of them (s).
+    `begun_at`: first stamp of any of them (s).
     """
 
     begun_at: float
@@ -284,11 +281,7 @@ class SeveralArrivals(Arrivals):
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
         return side_by_side([result.get(k, none) for k in range(len(self.streams))], self.site)
 
-    def next_window(
-        self,
-        _state: State,
-        _needs_separate: Callable[[State], bool],
-    ) -> float | None:
+    def next_window(self, _state: State, _needs_separate: Callable[[State], bool]) -> float | None:
         """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]

@@ -23,17 +23,8 @@ from magfusion.units import Array
 class ShortWindows:
     """The admitted short windows, and the noise of earlier ones.
 
-    Parameters
-    ----------
-    receiver : JointReceiver
-        It begins with the first state.
-
-    Attributes
-    ----------
-    numbers : deque of int
-        Of windows that are not used yet.
-    window : int, optional
-        At the state that is to be predicted.
+    `receiver`: it begins with the first state. `numbers`: of windows that are not used yet.
+    `window`: at the state that is to be predicted.
     """
 
     receiver: JointReceiver

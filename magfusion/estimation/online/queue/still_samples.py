@@ -9,12 +9,7 @@ from magfusion.units import Array
 class StillSamples:
     """When there are samples of the motion prior: on one grid, whose step the fields choose.
 
-    Attributes
-    ----------
-    until : float
-        Stamp of the last (s).
-    step : float
-        Between two (s); not finite before it is known.
+    `until`: stamp of the last (s). `step`: between two (s); not finite before it is known.
     """
 
     until: float
@@ -26,12 +21,8 @@ class StillSamples:
     def stamps(self, time: Array, *, raw: bool) -> Array:
         """Return the new stamps (s) up to some of the fields, and a step beyond.
 
-        Parameters
-        ----------
-        time : ndarray, shape (k,)
-            Of the fields (s), increasing; of the first epochs two are needed.
-        raw : bool
-            Whether they are samples, whose windows are longer than any step.
+        `time` (k,): of the fields (s), increasing; of the first epochs two are needed. `raw`:
+        whether they are samples, whose windows are longer than any step.
         """
         known = np.isfinite(self.step)
         if len(time) < (1 if raw or known else 2):
