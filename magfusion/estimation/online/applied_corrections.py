@@ -51,11 +51,15 @@ class AppliedCorrections:
         """Return these with one more; parameters as of `corrected_finding`."""
         result = AppliedCorrections()
         finding = corrected_finding(correction, declared, reasons)
-        for earlier in self.findings:
-            is_step = earlier.code == finding.code and correction is not self.rival
-            if is_step:  # whose text has only the remainder
-                finding = replace(finding, text=earlier.text)
-        known = tuple(f for f in self.findings if f.code != finding.code)
+        if self.rival is not None and correction.finding is self.rival.finding:
+            known = self.findings[:-1]
+        else:
+            known = tuple(f for f in self.findings if f.code != finding.code)
+            for earlier in self.findings:
+                if (
+                    earlier.code == finding.code
+                ):  # the text of a further step has only the remainder
+                    finding = replace(finding, text=earlier.text)
         result.findings, result.rival = (*known, finding), correction.rival
         result._spread = {f.code: self._spread[f.code] for f in known if f.code in self._spread}
         result.content = json.dumps(site_content(correction.site))

@@ -21,6 +21,7 @@ from magfusion.estimation.integrity.fixed_parameter_test import (
     causes_of,
     finding_of,
 )
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.steel_test import STEEL, steel_of_score
 from magfusion.estimation.integrity.suspects import Suspect
@@ -250,12 +251,19 @@ class OnlineScore:
         if cause.code == CHANGED:
             finding = change_finding(cause, prior_sigma(score.fixed))
             return Judgement((finding,), turn=float(turn), shift=float(shift))
-        finding = finding_of(targets.site, score, cause, rivals)
+        self.correction = self._correction_of(score, cause, rivals)
+        return Judgement((self.correction.finding,), turn=float(turn), shift=float(shift))
+
+    def _correction_of(
+        self, score: Score, cause: ReleasedFault, rivals: list[ReleasedFault]
+    ) -> Correction:
+        finding = finding_of(self.targets.site, score, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
-        uncertainty = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
-        spread = uncertainty if correction.spread is None else correction.spread + uncertainty
-        self.correction = correction._replace(spread=spread)
-        return Judgement((finding,), turn=float(turn), shift=float(shift))
+        spread = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+        if correction.spread is not None:
+            spread = spread + correction.spread
+        rival = self._correction_of(score, rivals[0], []) if rivals else None
+        return correction._replace(spread=spread, rival=rival)
 
     def _steel_of(self, score: Score, named: Sequence[NamedCause]) -> Judgement | None:
         """Return the judgement by steel; None if it does not explain the data better."""
