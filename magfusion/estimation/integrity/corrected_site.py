@@ -121,7 +121,7 @@ def with_wide_priors(site: Site, blocks: tuple[Block, ...], step: Array) -> Site
 
 
 def with_sigmas(calibration: Calibration, blocks: tuple[Block, ...], sigmas: list[Array]) -> Site:
-    """Return the site of a calibration with new sigmas, each the unit of its tangent vector."""
+    """Return the site of a calibration with new sigmas, in the units of the tangent vector."""
     site = calibration.site
     if site.correlation is not None:
         own = {(block.group, block.owner, block.kind) for block in blocks}

@@ -52,6 +52,7 @@ class Correction(NamedTuple):
     step: Array | None = None
     words: str = ""  # by how much they are wrong, as in the finding
     released: tuple[Block, ...] = ()  # parameters that the corrected solution estimates
+    is_rival: bool = False  # whether it takes the place of one that was contradicted
 
 
 class Trial(NamedTuple, Generic[T]):

@@ -38,6 +38,12 @@ class AppliedCorrections:
         self.rival: Correction | None = None
         self._next, self._wait = -np.inf, KEPT
 
+    def offered(self, possible: tuple[Correction, ...]) -> tuple[Correction, ...]:
+        """Return what may be tried, the most likely first: before all others the rival."""
+        if self.rival is None:
+            return possible
+        return self.rival._replace(is_rival=True), *possible
+
     def due(self, now: float) -> bool:
         """Return whether another correction may be tried at a time (s), and note that it is."""
         if now < self._next or len(self.findings) >= MOST_MISTAKES:
@@ -51,15 +57,11 @@ class AppliedCorrections:
         """Return these with one more; parameters as of `corrected_finding`."""
         result = AppliedCorrections()
         finding = corrected_finding(correction, declared, reasons)
-        if self.rival is not None and correction.finding is self.rival.finding:
-            known = self.findings[:-1]
-        else:
+        known = self.findings[:-1]  # a rival takes the place of the last one
+        if not correction.is_rival:
             known = tuple(f for f in self.findings if f.code != finding.code)
-            for earlier in self.findings:
-                if (
-                    earlier.code == finding.code
-                ):  # the text of a further step has only the remainder
-                    finding = replace(finding, text=earlier.text)
+            earlier = next((f for f in self.findings if f.code == finding.code), finding)
+            finding = replace(finding, text=earlier.text)  # that of a step has only the remainder
         result.findings, result.rival = (*known, finding), correction.rival
         result._spread = {f.code: self._spread[f.code] for f in known if f.code in self._spread}
         result.content = json.dumps(site_content(correction.site))

@@ -364,9 +364,8 @@ class Navigator:
         """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
         possible, self._loop.possible = self._loop.possible, ()
         applied = self._loop.corrections
-        if not possible or not applied.due(self._history.newest):
-            return ()
-        return possible if applied.rival is None else (applied.rival, *possible)
+        is_due = possible and applied.due(self._history.newest)
+        return applied.offered(possible) if is_due else ()
 
     def with_correction(self, correction: Correction) -> "Navigator":
         """Return a navigator of a corrected site that has processed the newest input again.
