@@ -23,7 +23,7 @@ from magfusion.estimation.measurements.steel import (
     steel_modes,
 )
 from magfusion.files.log import write_log
-from magfusion.files.site import save_site
+from magfusion.files.site import load_site, save_site
 from magfusion.model.field import predict
 from magfusion.model.parameters import Block, initial_calibration
 from magfusion.model.site import Beacon, Site
@@ -241,6 +241,14 @@ def test_a_log_without_steel_is_not_mapped(log: Path, tmp_path: Path) -> None:
     )
 
 
+def test_one_log_without_steel_is_calibrated_without_a_map(log: Path, tmp_path: Path) -> None:
+    report = _report(tmp_path / "site", "calibrate", "log", log, "--map-steel")
+    assert report["steel_maps"] == [
+        {"log": "log", "used": "no", "reason": "the log shows none"},
+    ]
+    assert not (tmp_path / "site" / "steel.parquet").exists()
+
+
 def test_fixes_in_a_graph_do_not_test_a_map() -> None:
     """They contain it, and the graph has no fields that could contradict it."""
     small = small_log(10)
@@ -254,4 +262,45 @@ def test_fixes_in_a_graph_do_not_test_a_map() -> None:
 
 def test_whole_rests_are_not_mapped(log: Path, refuse: Refuse) -> None:
     findings = refuse("smooth", log, "--map-steel", "--at-rest", "-o", "run")
-    assert "--map-steel maps the steel along one log" in findings
+    assert "--map-steel maps the steel along the path" in findings
+
+
+@pytest.mark.slow
+def test_logs_in_a_room_are_calibrated_with_its_map(tmp_path: Path) -> None:
+    """Beacons are then where they are, which the steel would move otherwise."""
+    site, rng = replace(demo_site(coil_radius=None), model_error=0.005), np.random.default_rng(1)
+    beacons = np.array([beacon.position_world for beacon in site.beacons])
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        duration=30.0,
+        imu_rate_hz=100.0,
+        magnetometer_rate_hz=160.0,
+        ambient=Ambient(rails=draw_steel("mesh", rng, DEMO_BOX_WORLD, beacons)),
+    )
+    first = simulate_log(site, config, rng)
+    same = replace(config, perturb=False)
+    second = simulate_log(first.true_site, same, rng)
+    logs = tmp_path / "first", tmp_path / "second"
+    for place, built in zip(logs, (first, second), strict=True):
+        write_log(built.log, place)
+        save_site(site, place / "site.yaml")
+    command = "calibrate", "log", *logs, "--workers", 1
+    error = {}
+    for name, options in (("plain", ()), ("mapped", ("--map-steel",))):
+        report = _report(tmp_path / name, *command, *options)
+        refined = load_site(tmp_path / name / "site.yaml")
+        assert all((one.steel is not None) == (name == "mapped") for one in refined.beacons)
+        error[name] = np.linalg.norm(
+            [
+                one.position_world - true.position_world
+                for one, true in zip(refined.beacons, first.true_site.beacons, strict=True)
+            ]
+        )
+    rows = report["steel_maps"]
+    assert [row["log"] for row in rows] == ["first", "second"]
+    assert rows[0]["used"] == "yes"
+    assert rows[0]["error_ratio"] < 1.0
+    assert (tmp_path / "mapped" / "steel.parquet").is_file()
+    assert error["mapped"] < 0.75 * error["plain"]
+    again = _report(tmp_path / "mapped", *command, "--map-steel")
+    assert again["steel_maps"] == rows  # kept

@@ -131,7 +131,7 @@ ROOMS = {
             antenna_report antenna_trust coverage drift init joint_calendar match record_source
             navigate_rests
             calibrate_antenna design_figures joint_driver navigate
-            joint_run
+            joint_run steel_of_logs
             joint_result
             calibrate_log design smooth
             demo

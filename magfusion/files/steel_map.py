@@ -4,6 +4,7 @@
 next to a site has a row for each voxel and coil, with the moment by which the field is predicted.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,14 @@ def write_steel_map(
     columns = dict(zip(POSITION, centre_world.T, strict=True))
     columns |= {"edge_m": edge, "polarisability_m3": polarisability}
     _write(path, columns | {"polarisability_sigma_m3": sigma})
+
+
+def join_steel_maps(path: Path, parts: Sequence[Path]) -> None:
+    """Write the voxels of several maps."""
+    with whole_file(path) as unfinished:
+        pa.parquet.write_table(
+            pa.concat_tables([pa.parquet.read_table(part) for part in parts]), unfinished
+        )
 
 
 def write_steel_fields(path: Path, steel: dict[str, SteelField]) -> None:

@@ -87,6 +87,11 @@ class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
         "Search for beacons that were moved or exchanged between the logs, and platforms that"
         " changed; estimate them separately before and after",
     )
+    map_steel: bool = option(
+        False,
+        "Map the steel near the paths first, one log after the other, and calibrate with the maps"
+        " that predict beacons left out",
+    )
 
 
 def run_calibrate_log(
@@ -98,6 +103,7 @@ def run_calibrate_log(
     from magfusion.estimation.integrity.judge import judge_result
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.result_directory import claim, result_in
+    from magfusion.jobs.steel_of_logs import SteelOfLogs, map_steel_of_logs
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
     from magfusion.results.report import compared_with_truth, placement_figures, smoothed_figures
@@ -109,10 +115,21 @@ def run_calibrate_log(
 
         if settings.cross_validate is not None:
             raise InputError("--cross-validate splits one log; several were given")
-        return run_joint(JOB, settings, smoother, output, report, by_date=settings.calendar)
+        return run_joint(
+            JOB,
+            settings,
+            smoother,
+            output,
+            report,
+            by_date=settings.calendar,
+            mapping=settings.map_steel,
+        )
     if settings.calendar:
         raise InputError("--calendar compares several logs; one was given")
-    claimed = claim(output, JOB)
+    claimed, steel = claim(output, JOB), SteelOfLogs([job])
+    if settings.map_steel:
+        steel = map_steel_of_logs([job], smoother, output, report)
+    (job,) = steel.jobs
     log, site = read_job(job, unknown=True, report=report)
     cuts = _cuts(job, log, site, settings.cross_validate)
     with named(job.log_path), _as_failure(job.log_path):
@@ -126,7 +143,7 @@ def run_calibrate_log(
     result, moved = against_site(honest, grown(result, honest))
     with _as_failure(job.log_path):
         compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
-    trust = _report_once(trust, moved)
+    trust = _report_once(trust, moved) | steel.trust
     if compared is not None:
         trust |= transferred(compared)
     parts_of = result.calibration, result.blocks, result.calibration_cov
@@ -142,9 +159,11 @@ def run_calibrate_log(
     figures |= Figures(Figure("missing_motion", missing, section=Section.DIRECTIONS, label=label))
     if compared is not None:
         figures |= _transfer_figures(compared)
+    figures |= steel.figures
     estimates = parameter_estimates(result.declared, *parts_of)
     with result_in(claimed, figures, trust, job.log_path, output) as directory:
         save_site(result_site(result, log.name), directory / "site.yaml")
+        steel.write(directory)
         write_log_calibration_plot(
             directory / "calibration.png",
             estimates,

@@ -16,7 +16,8 @@ from magfusion.jobs.joint_run import Joint, refine, tasks_of
 from magfusion.jobs.joint_tasks import together_settings
 from magfusion.jobs.result_directory import claim, keep_results
 from magfusion.jobs.settings import LogsSettings
-from magfusion.jobs.written import CALENDAR_TABLE, LOGS, LOGS_TABLE, PLATFORMS
+from magfusion.jobs.steel_of_logs import SteelOfLogs, map_steel_of_logs
+from magfusion.jobs.written import CALENDAR_TABLE, KEPT, LOGS, LOGS_TABLE, PLATFORMS
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.progress import Report
 from magfusion.model.site import Site
@@ -47,17 +48,22 @@ def run_joint(
     rate: Rate = "field",
     risk: Risk | None = None,
     by_date: bool = False,
+    mapping: bool = False,
 ) -> Figures:
     """Refine one site with several logs together.
 
     `command`: the former writes the trajectory of each log too. `by_date`: whether changes between
-    the logs are searched.
+    the logs are searched. `mapping`: whether the steel near the paths is mapped first.
     """
     writes = command == "smooth"
     claimed = claim(output, *(("smooth", "fix") if writes else (command,)))
     jobs: list[Job] = settings.jobs(output)
     tasks = tasks_of(jobs, together_settings(smoother), output)
     began = time.perf_counter()
+    steel = SteelOfLogs(jobs)
+    if mapping:
+        steel = map_steel_of_logs(jobs, smoother, output, report)
+        tasks = tasks_of(steel.jobs, together_settings(smoother), output)
     joint = refine(
         tasks,
         cluster=settings.cluster,
@@ -72,7 +78,9 @@ def run_joint(
     calibration, cov = _calibration(joint, 0)
     declared, blocks = joint.calendar.platforms[0].shared.declared, _blocks(joint)
     estimates = parameter_estimates(declared, calibration, blocks, cov)
+    joint = replace(joint, trust=joint.trust | steel.trust)
     figures = heading(command, name) | _figures(joint, calibration, cov, estimates, writes=writes)
+    figures |= steel.figures
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     result = observability(calibration, blocks, cov)
     with claimed as whole:
@@ -82,6 +90,8 @@ def run_joint(
             (whole / PLATFORMS).mkdir(exist_ok=True)
             save_site(_other_site(joint, i, name), whole / PLATFORMS / f"{i + 1}.yaml")
         write_rows(whole / LOGS_TABLE, joint.table)
+        steel.write(whole)
+        steel.keep(whole / KEPT, output)
         if joint.months:
             write_rows(whole / CALENDAR_TABLE, joint.months)
         if not writes:

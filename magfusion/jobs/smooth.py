@@ -88,10 +88,10 @@ class SmoothSettings(
             raise InputError(f"--free {self.free!r}: smooth estimates gain only; write --free gain")
         if self.at_rest:
             self._check_rests()
-        if self.map_steel and (self.more or self.at_rest or self.coupling == "loose"):
+        if self.map_steel and (self.at_rest or self.coupling == "loose"):
             raise InputError(
-                "--map-steel maps the steel along one log by its fields; omit --at-rest and"
-                " --coupling loose, and give one log"
+                "--map-steel maps the steel along the path by its fields; omit --at-rest and"
+                " --coupling loose"
             )
         if self.more and self.engine != "bordered":
             raise InputError(
@@ -147,8 +147,16 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
     if settings.more:
         from magfusion.jobs.joint_result import run_joint
 
-        parts = settings, smoother, output, report
-        return run_joint("smooth", *parts, rate=settings.rates, risk=settings.risks)
+        return run_joint(
+            "smooth",
+            settings,
+            smoother,
+            output,
+            report,
+            rate=settings.rates,
+            risk=settings.risks,
+            mapping=settings.map_steel,
+        )
     place = settings.checkpoint
     return run_smooth(
         job,

@@ -167,6 +167,15 @@ def finished(
     return Finished(site, result, trust, by_state, figures, None, possible, further, used)
 
 
+def map_of_steel(result: Smoothed, trust: Trust, log: Log) -> SteelMap | str:
+    """Return the map of the steel near a path, or why there is none.
+
+    `result`: whose covariance no test has widened.
+    """
+    other = next((f.code for f in trust.reasons if f.code not in (STEEL, *OF_STEEL)), None)
+    return f"{other} is a reason for doubt, too" if other else map_steel(result, log.imu)
+
+
 def _with_map(
     before: Smoothed, result: Smoothed, trust: Trust, log: Log
 ) -> tuple[Smoothed, Trust, SteelMap | None]:
@@ -174,8 +183,7 @@ def _with_map(
 
     `before`: whose covariance no test has widened.
     """
-    other = next((f.code for f in trust.reasons if f.code not in (STEEL, *OF_STEEL)), None)
-    steel = f"{other} is a reason for doubt, too" if other else map_steel(before, log.imu)
+    steel = map_of_steel(before, trust, log)
     if isinstance(steel, str):
         remark = Finding(STEEL, f"The steel is not mapped: {steel}.", Verdict.TRUSTWORTHY)
         return result, trust | Trust((remark,)), None

@@ -38,7 +38,7 @@ WRITTEN = {
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
     "calibrate log": _SITE
-    | {"calibration.png", "report.json", KEPT, LOGS_TABLE, PLATFORMS, CALENDAR_TABLE},
+    | {"calibration.png", "report.json", KEPT, LOGS_TABLE, PLATFORMS, CALENDAR_TABLE, STEEL_MAP},
     "calibrate beacon": _SITE | {"beacon.png", "report.json"},
     "calibrate antenna": _SITE | {"antenna.png", "report.json"},
     "calibrate response": _SITE | {"report.json"},
