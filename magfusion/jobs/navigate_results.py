@@ -21,6 +21,7 @@ from magfusion.estimation.integrity.likely_cause import QUANTISED, coarse_steps
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
+from magfusion.files.site_changes import changed_keys
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.state_rows import CURRENT, LAGGED, PROPAGATED, STATE
@@ -186,6 +187,7 @@ def navigated(
     states = current.states
     trust |= _without_levels(current.trust, navigator)
     estimates, refined = _calibration(navigator, log.name)
+    trust = _with_newest_values(trust, navigator.declared, refined)
     errors, compared = compared_with_truth(states, comparable(log, states, site))
     compared = axis_figures(states, errors, _frame(navigator)) | compared
     figures = heading("navigate", log.name) | trust_figures(trust)
@@ -213,6 +215,18 @@ def navigated(
     return figures, NavigateResults(
         trust, current, lagged, propagated, errors, innovations, refined
     )
+
+
+def _with_newest_values(trust: Trust, declared: Site, refined: Site) -> Trust:
+    """Return findings whose remedies have the newest estimates in the place of the first ones."""
+    newest = changed_keys(declared, refined)
+    findings = tuple(
+        replace(f, remedy={key: newest.get(key, value) for key, value in f.remedy.items()})
+        if f.remedy
+        else f
+        for f in trust.findings
+    )
+    return replace(trust, findings=findings)
 
 
 def _calibration(navigator: Navigator, name: str) -> tuple[list[ParameterEstimate], Site]:
