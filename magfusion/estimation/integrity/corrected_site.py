@@ -8,9 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.suspects import (
+    ACCEL_BIAS,
     ACCEL_SCALE,
     GRAVITY,
     GYRO_ALIGNMENT,
+    GYRO_BIAS,
     GYRO_G_SENSITIVITY,
     GYRO_SCALE,
     STRETCH,
@@ -54,6 +56,9 @@ def with_imu(site: Site, **changed: float) -> Site:
 
 # Those of the inertial sensors, which no estimated parameter describes.
 _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
+    # The states estimate them: their sigmas are too small.
+    GYRO_BIAS: lambda site, step: with_imu(site, gyro_bias_sigma=float(np.max(np.abs(step)))),
+    ACCEL_BIAS: lambda site, step: with_imu(site, accel_bias_sigma=float(np.max(np.abs(step)))),
     GYRO_SCALE: lambda site, step: with_intrinsics(site, np.diag(1.0 + step)),
     ACCEL_SCALE: lambda site, step: with_intrinsics(site, accel=np.diag(1.0 + step)),
     GYRO_ALIGNMENT: lambda site, step: with_intrinsics(

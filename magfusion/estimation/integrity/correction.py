@@ -14,7 +14,11 @@ from magfusion.estimation.integrity.corrected_site import (
     with_wide_priors,
 )
 from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
-from magfusion.estimation.integrity.fixed_parameter_test import amounts, error_in_words
+from magfusion.estimation.integrity.fixed_parameter_test import (
+    amounts,
+    error_in_words,
+    finding_of,
+)
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
@@ -81,24 +85,31 @@ def corrections(
         return result  # no parameter undoes what steps distort
     finding = next((f for f in findings if causes and f.code == causes[0].code), None)
     if finding is not None:
-        best, *rivals = causes
-        weight = np.exp([0.5 * (rival.gain - best.gain) for rival in rivals])
-        spread = np.zeros((len(best.moved), 6, 6))
-        for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
-            spread += share * _outer(rival.moved - best.moved)
-        by_score = Correction(
-            finding,
-            corrected_site(site, best.fault, best.step),
-            best.fault,
-            spread,
-            step=best.step,
-            words=error_in_words(site, best),
-        )
-        result.append(by_score._replace(spread=_with_rival_frame(site, by_score, 0.5)))
+        result.append(_by_score(site, finding, *causes))
     if diagnosis is not None and diagnosis.site is not None:
         by_snapshots = _by_snapshots(site, diagnosis)
         result.insert(0 if by_snapshots.clear else len(result), by_snapshots)
     return result
+
+
+def _by_score(
+    site: Site, finding: Finding, best: ReleasedFault, *rivals: ReleasedFault
+) -> Correction:
+    """Return the correction of a cause by the score, with its rival."""
+    weight = np.exp([0.5 * (rival.posterior_gain - best.posterior_gain) for rival in rivals])
+    spread = np.zeros((len(best.moved), 6, 6))
+    for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
+        spread += share * _outer(rival.moved - best.moved)
+    known = Correction(
+        finding,
+        corrected_site(site, best.fault, best.step),
+        best.fault,
+        spread,
+        rival=_by_score(site, finding_of(site, rivals[0]), rivals[0]) if rivals else None,
+        step=best.step,
+        words=error_in_words(site, best),
+    )
+    return known._replace(spread=_with_rival_frame(site, known, 0.5))
 
 
 def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
@@ -146,7 +157,9 @@ def best_trial(
         else:
             further = None if explains_all else correction.rival
         if further is not None:
-            waiting.insert(0, further)
+            # By the score a rival is as likely as what the snapshots suggest, and less clear.
+            is_rest = remainder is not None or correction.fault is None
+            waiting.insert(0 if is_rest else len(waiting), further)
         elif best is not None and best is trial:
             break
     return None if best is None else best.result

@@ -14,6 +14,8 @@ from magfusion.estimation.data_checks.statistics import sigmas
 from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
 from magfusion.estimation.integrity.suspects import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
     STRETCH,
     TILT,
     TYPICAL_TILT,
@@ -59,7 +61,7 @@ def check_fixed_parameters(case: Case) -> TestResult:
         spread += moved[:, :, None] * moved[:, None, :]
         spread += score.by_pose @ known_cov @ np.swapaxes(score.by_pose, 1, 2)
     return TestResult(
-        tuple(finding_of(site, score, one.cause, one.rivals) for one in causes),
+        tuple(finding_of(site, one.cause, one.rivals) for one in causes),
         unverified,
         spread=spread,
         named=tuple(one.total for one in causes),
@@ -94,9 +96,11 @@ def causes_of(
             release_fault(pose_cov, score, fault, information, gradient)
             for fault in candidates(information, gradient)
         )
-        ranked = sorted((one for one in released if one is not None), key=lambda one: -one.gain)
-        if not ranked or ranked[0].gain < max(LEAST_EVIDENCE, LEAST_SHARE * first):
+        every = [one for one in released if one is not None]
+        largest = max((one.gain for one in every), default=0.0)
+        if largest < max(LEAST_EVIDENCE, LEAST_SHARE * first):
             return
+        ranked = sorted(every, key=lambda one: -one.posterior_gain)
         cause = simplest(ranked)
         if not is_cause(cause, total):
             return
@@ -112,7 +116,7 @@ def causes_of(
 def simplest(ranked: list[ReleasedFault]) -> ReleasedFault:
     """Return the part of the first cause with the fewest parameters that explains a log as well."""
     own = _keys(ranked[0])
-    parts = (one for one in ranked if one.gain > ranked[0].gain - MARGIN and _keys(one) <= own)
+    parts = (one for one in _as_likely(ranked) if _keys(one) <= own)
     return min(parts, key=lambda one: one.fault.combine.shape[1])
 
 
@@ -124,7 +128,11 @@ def rivals_of(cause: ReleasedFault, ranked: list[ReleasedFault]) -> list[Release
         keys = _keys(one)
         return one.fault.code != cause.fault.code or not (keys <= own or own <= keys)
 
-    return [one for one in ranked if one.gain > ranked[0].gain - MARGIN and is_other(one)]
+    return [one for one in _as_likely(ranked) if is_other(one)]
+
+
+def _as_likely(ranked: list[ReleasedFault]) -> list[ReleasedFault]:
+    return [one for one in ranked if one.posterior_gain > ranked[0].posterior_gain - MARGIN]
 
 
 def _keys(cause: ReleasedFault) -> set[tuple[Parameter, str]]:
@@ -142,9 +150,7 @@ def _exceeds_residuals(case: Case, score: Score, one: ReleasedFault, before: Arr
     return one.gain / excess > LEAST_EVIDENCE
 
 
-def finding_of(
-    site: Site, score: Score, cause: ReleasedFault, rivals: Sequence[ReleasedFault] = ()
-) -> Finding:
+def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault] = ()) -> Finding:
     """Return the finding on a cause, and on others that explain the log as well."""
     position = float(np.sqrt(np.mean(np.sum(cause.moved[:, 3:] ** 2, axis=1))))
     rotation = float(np.rad2deg(np.sqrt(np.mean(np.sum(cause.moved[:, :3] ** 2, axis=1)))))
@@ -155,7 +161,7 @@ def finding_of(
         remedy = "Multiply all positions by a common factor: check the tape, or the unit"
     elif len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
         block = cause.fault.blocks[0]
-        factor = float(np.exp((prior_sigma(score.fixed) * cause.step)[block.columns][0]))
+        factor = float(np.exp(block.sigma * cause.step[block.columns])[0])
         result = f"all are {factor:.3g} times as large"
         remedy = "Correct them (peak, not rms; their unit), or declare their sigma"
     elif cause.fault.code == TILT:
@@ -216,6 +222,8 @@ def _unverified(case: Case, score: Score) -> list[Unverified]:
     """Return fixed parameters that the log does not check, with their effect on the poses."""
     out, information = [], score.within_tolerance()
     for block in score.fixed:
+        if block.parameter in (GYRO_BIAS, ACCEL_BIAS):  # the states estimate them
+            continue
         rows = np.arange(len(score.information))[block.columns]
         declared = score.spread[rows]
         cov = declared @ declared.T

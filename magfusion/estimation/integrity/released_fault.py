@@ -57,6 +57,11 @@ class ReleaseGain:
         """Decrease of -2 log likelihood of the log, the parameters having their prior."""
         return float(np.sum(_evidence(self.along, self.information)))
 
+    @property
+    def posterior_gain(self) -> float:
+        """The same of -2 log posterior: with how often the parameters are wrong."""
+        return self.gain + 2.0 * float(np.log(self.fault.odds))
+
 
 @dataclass(frozen=True, eq=False)
 class ReleasedFault(ReleaseGain):

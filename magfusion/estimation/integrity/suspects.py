@@ -79,6 +79,25 @@ class Inertial(Parameter):
         raise NotImplementedError
 
 
+class _Bias(Inertial):
+    """A constant bias: the states have one, which its declared sigma keeps near zero."""
+
+    columns: ClassVar[slice]
+
+    def as_bias(self, stream: Stream) -> Array:
+        return np.broadcast_to(np.eye(6)[:, self.columns], (len(stream.imu), 6, 3))
+
+
+class _GyroBias(_Bias):
+    kind, components, display_unit = "gyro_bias", AXES, ParameterUnit("rad/s", 1.0)
+    words, columns = "the bias of the gyro's {axis}", slice(3, 6)
+
+
+class _AccelBias(_Bias):
+    kind, components, display_unit = "accel_bias", AXES, ParameterUnit("m/s^2", 1.0)
+    words, columns = "the bias of the accelerometer's {axis}", slice(0, 3)
+
+
 class _GyroScale(Inertial):
     kind, components, display_unit = "gyro_scale", AXES, PERCENT
     words = "the scale of the gyro's {axis}"
@@ -135,7 +154,10 @@ def _stacked(accel: Array, gyro: Array) -> Array:
 
 GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT = _GyroScale(), _AccelScale(), _GyroAlignment()
 GYRO_G_SENSITIVITY, GRAVITY = _GyroGSensitivity(), _Gravity()
+GYRO_BIAS, ACCEL_BIAS = _GyroBias(), _AccelBias()
 INERTIAL: tuple[Inertial, ...] = (
+    GYRO_BIAS,
+    ACCEL_BIAS,
     GYRO_SCALE,
     ACCEL_SCALE,
     GYRO_ALIGNMENT,
@@ -159,6 +181,8 @@ TYPICAL: dict[Parameter, float] = {
     TIME_OFFSET: 1e-3,
     DECLINATION: DEGREE,
     STRENGTH: 0.5,
+    GYRO_BIAS: 0.01,
+    ACCEL_BIAS: 0.1,
     GYRO_SCALE: 0.01,
     ACCEL_SCALE: 0.01,
     GYRO_ALIGNMENT: DEGREE,
@@ -211,6 +235,8 @@ CODE: dict[Parameter, str] = {
     TIME_OFFSET: "time_offset",
     DECLINATION: "earth_field",
     STRENGTH: "earth_field",
+    GYRO_BIAS: "imu_bias",
+    ACCEL_BIAS: "imu_bias",
     GYRO_SCALE: "gyro_scale",
     ACCEL_SCALE: "accel_scale",
     GYRO_ALIGNMENT: "imu_axes",
@@ -228,6 +254,10 @@ CODE: dict[Parameter, str] = {
 }
 
 TILT, STRETCH = "survey_tilt", "survey_scale"
+# How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
+# seldom tilted or stretched, and gyros seldom are that bad.
+RARE = 0.1
+RARELY_WRONG: tuple[Parameter, ...] = (GYRO_ALIGNMENT, GYRO_G_SENSITIVITY, GRAVITY)
 TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned by more
 
 
@@ -240,6 +270,7 @@ class Suspect(NamedTuple):
     # typical
     combine: Array
     code: str = ""  # of its finding; otherwise that of the first block's parameter
+    odds: float = 1.0  # prior, relative to the usual
 
     @property
     def finding_code(self) -> str:
@@ -278,8 +309,10 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
         columns = np.concatenate([np.arange(size)[b.columns] for b in chosen])
         return Suspect(name, tuple(chosen), np.eye(size)[:, columns])
 
-    single = (b for b in held if not isinstance(b.parameter, SteelModes))  # `steel_test` has those
-    yield from (together(spoken_name(b), [b]) for b in single)
+    for block in held:
+        if not isinstance(block.parameter, SteelModes):  # `steel_test` has those
+            odds = RARE if block.parameter in RARELY_WRONG else 1.0
+            yield together(spoken_name(block), [block])._replace(odds=odds)
     poses = {b.name: f"the pose of beacon {b.name}" for b in site.beacons}
     sets = {
         f"the positions of {_beacons(site)}": (BEACON_POSITION,),
@@ -302,11 +335,12 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
         yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
     if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
         blocks = tuple(surveyed)
-        yield Suspect("the vertical of the survey", blocks, survey_tilt(site, blocks, size), TILT)
+        tilt = survey_tilt(site, blocks, size)
+        yield Suspect("the vertical of the survey", blocks, tilt, TILT, RARE)
     places = tuple(b for b in surveyed if b.parameter == BEACON_POSITION)
     if len(places) == len(site.beacons) > 1:
         stretch = survey_scale(site, places, size)
-        yield Suspect("the scale of the survey", places, stretch, STRETCH)
+        yield Suspect("the scale of the survey", places, stretch, STRETCH, RARE)
 
 
 def survey_tilt(site: Site, surveyed: tuple[Block, ...], size: int) -> Array:
@@ -356,6 +390,8 @@ def spoken_name(block: Block) -> str:
         TIME_OFFSET: "the IMU's time offset",
         DECLINATION: "the declination of the Earth field",
         STRENGTH: "the strength of the Earth field",
+        GYRO_BIAS: "the bias of the gyro",
+        ACCEL_BIAS: "the bias of the accelerometer",
         GYRO_SCALE: "the scale of the gyro",
         ACCEL_SCALE: "the scale of the accelerometer",
         GYRO_ALIGNMENT: "the axes of the gyro",

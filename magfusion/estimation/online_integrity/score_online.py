@@ -257,7 +257,7 @@ class OnlineScore:
     def _correction_of(
         self, score: Score, cause: ReleasedFault, rivals: list[ReleasedFault]
     ) -> Correction:
-        finding = finding_of(self.targets.site, score, cause, rivals)
+        finding = finding_of(self.targets.site, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
         spread = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
         if correction.spread is not None:
