@@ -26,23 +26,12 @@ PER_RESOLUTION = 4  # trial frequencies
 
 @dataclass(frozen=True, eq=False)
 class Integrated:
-    """One tone of a whole stationary interval.
+    """One tone of a whole stationary interval."""
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (3,)
-        (T)
-    cov : ndarray, shape (3, 3)
-        Of its real, and of its imaginary part (T^2).
-    freedom : int
-        Degrees of freedom of the covariance.
-    centroid, spread : float
-        Of the weights over time (s).
-    """
-
-    phasor: ComplexArray
-    cov: Array
-    freedom: int
+    phasor: ComplexArray  # (3,) (T)
+    cov: Array  # (3, 3), of its real, and of its imaginary part (T^2)
+    freedom: int  # degrees of freedom of the covariance
+    # centroid, spread: of the weights over time (s)
     centroid: float
     spread: float
 

@@ -74,21 +74,13 @@ def _long(site: Site, requested: LockinSettings | None) -> LockinSettings | None
 
 
 class JointDesign(NamedTuple):
-    """Information of a window's samples on all tones together.
+    """Information of a window's samples on all tones together."""
 
-    Parameters
-    ----------
-    across : ndarray, shape (m, directions)
-        Orthonormal: the tones orthogonal to steady field, drift and mains.
-    tones : ndarray, shape (nodes, directions, 2 tones)
-        Cosines and sines of each tone in these directions, by node.
-    extra_design : ndarray, shape (m, probes)
-        Orthonormal, next to the tones: directions of noise.
-    """
-
+    # (m, directions), orthonormal: the tones orthogonal to steady field, drift and mains
     across: Array
+    # (nodes, directions, 2 tones), cosines and sines of each tone in these directions, by node
     tones: Array
-    extra_design: Array
+    extra_design: Array  # (m, probes), orthonormal, next to the tones: directions of noise
 
     @staticmethod
     def of(
