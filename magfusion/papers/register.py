@@ -159,10 +159,7 @@ class Paper(StrictModel):
     def select(self, words: str) -> list[NumberedEntry]:
         """Return the entries selected by ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
 
-        Raises
-        ------
-        InputError
-            Where the paper has no such entry.
+        Raises InputError where the paper has no such entry.
         """
         parts = _QUERY.fullmatch(words.lower())
         if parts is None or not any(parts.groups()):
@@ -185,10 +182,7 @@ class Paper(StrictModel):
 def paper(name: str) -> Paper:
     """Return one of the papers of `ROOMS`, by its number or its DOI.
 
-    Raises
-    ------
-    InputError
-        Where there is no such paper.
+    Raises InputError where there is no such paper.
     """
     if name in ROOMS:
         return _read(name)
