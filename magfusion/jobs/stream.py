@@ -148,12 +148,8 @@ def _navigate(
 class _StateWriter:
     """Writes states as they are estimated, and sends them to the other outputs.
 
-    `sink`: binary.
-
-    Attributes
-    ----------
-    reference : bool
-        Whether samples of a reference sensor have arrived, which are not used here.
+    `sink`: binary. Attribute `reference`: whether samples of a reference sensor have arrived, which
+    are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:

@@ -60,36 +60,17 @@ class Citation(StrictModel):
 
 
 class PaperEntry(StrictModel):
-    """One equation, table, figure or claim.
+    """One equation, table, figure or claim."""
 
-    Parameters
-    ----------
-    `says` : str
-        The paper's statement, in a few words.
-    where : str
-        The section, for entries without a printed number.
-    finding : str
-        One of `FINDINGS`.
-    why : str
-        The correction, the counter-example, or the missing information.
-    figures : str
-        The numbers that the paper prints, and those computed here.
-    functions : list of str
-        Callable functions; a name without dots is in the paper's ``equations``.
-    tests : list of str
-        Node ids of the tests that show it.
-    scenario : str, optional
-        The scenario file that shows it in full.
-    """
-
-    says: str
-    where: str = ""
-    finding: Finding
-    why: str = ""
-    figures: str = ""
+    says: str  # the paper's statement, in a few words
+    where: str = ""  # the section, for entries without a printed number
+    finding: Finding  # one of `FINDINGS`
+    why: str = ""  # the correction, the counter-example, or the missing information
+    figures: str = ""  # the numbers that the paper prints, and those computed here
+    # callable functions; a name without dots is in the paper's ``equations``
     functions: list[str] = Field(default_factory=list)
-    tests: list[str] = Field(default_factory=list)
-    scenario: str | None = None
+    tests: list[str] = Field(default_factory=list)  # node ids of the tests that show it
+    scenario: str | None = None  # the scenario file that shows it in full
 
     @model_validator(mode="after")
     def _check_declared(self) -> Self:

@@ -89,22 +89,15 @@ class Figure:
 class ParameterEstimate(Figure):
     """One calibration parameter after the fit; the value is its change from the declared one.
 
-    Parameters
-    ----------
-    label : str
-        Of its vector, which is one line on the screen.
-    sigma, prior_sigma : float
-        Posterior and prior standard deviation; a prior of zero is none.
-    is_open : bool
-        Whether the measurements do not determine it, whatever its sigma.
-    declared : float, optional
-        Its value before, if any: of a rotation only the change is a number.
+    `label`: of its vector, which is one line on the screen.
     """
 
     section: Section = Section.CALIBRATION
+    # sigma, prior_sigma: posterior and prior standard deviation; a prior of zero is none
     sigma: float = 0.0
     prior_sigma: float = 0.0
-    is_open: bool = False
+    is_open: bool = False  # whether the measurements do not determine it, whatever its sigma
+    # its value before, if any: of a rotation only the change is a number
     declared: float | None = None
 
     @property
