@@ -74,7 +74,8 @@ def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     maximum = int(FARTHEST * span / result.length) - NEAREST
     others = NEAREST + np.arange(int(np.clip(maximum, MIN_NEIGHBOURS, MAX_NEIGHBOURS)))
     offsets_hz = np.concatenate([-others, others]) / span
-    detected = _taper_response(offsets_hz * result.length)
+    bins = offsets_hz * result.length
+    detected = np.sinc(bins) / (1.0 - bins**2)  # gain of a Hann taper
     carrier = np.exp(-2j * np.pi * offsets_hz[:, None] * elapsed)
     power = ((carrier * weight) @ (phasor - mean)) / detected[:, None]
     freedom = 2 * len(offsets_hz)
@@ -84,11 +85,6 @@ def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     centroid = float(weight @ elapsed)
     spread = float(np.sqrt(weight @ (elapsed - centroid) ** 2))
     return Integrated(mean, cov, freedom, centroid, spread)
-
-
-def _taper_response(bins: Array) -> Array:
-    """Return the gain of a Hann taper at an offset in bins."""
-    return np.asarray(np.sinc(bins) / (1.0 - bins**2))
 
 
 def _weights(phasor: ComplexArray) -> Array:

@@ -21,7 +21,7 @@ from magfusion.receiver.design import nuisances_hz
 from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array
 
 SHORT_WINDOW = 0.2  # s
 NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: changes in between are a parabola
@@ -215,6 +215,3 @@ class JointReceiver(LockinReceiver):
     def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
         """Return one: directions without samples only lose their information."""
         return np.ones(len(windows))
-
-    def _driven(self, windows: Windows) -> BoolArray:
-        return np.ones(len(windows), dtype=bool)
