@@ -16,10 +16,7 @@ class EstimationError(RuntimeError):
 class InputErrors(InputError):
     """Several errors in one message, so that a user can correct them together.
 
-    Parameters
-    ----------
-    lines : sequence of str
-        The first states what was rejected; then a sentence each, and the proposals.
+    `lines`: the first states what was rejected; then a sentence each, and the proposals.
     """
 
     def __init__(self, *lines: str) -> None:

@@ -47,14 +47,8 @@ def starts(
 ) -> tuple[MagnetometerFit, ...]:
     """Return one or several initial offsets, with the matrix as declared.
 
-    Parameters
-    ----------
-    time_offset : float
-        Added to the IMU's stamps (s).
-    offset_cov : ndarray, shape (3, 3)
-        Prior (T^2).
-    size : float
-        Of the field (T).
+    `time_offset`: added to the IMU's stamps (s). `offset_cov` (3, 3): prior (T^2). `size`: of the
+    field (T).
     """
     to_body = known.body_from_sensor @ np.linalg.inv(known.matrix)
     body = (readings.measured_sensor - known.offset) @ to_body.T

@@ -72,10 +72,7 @@ def aiding_rows(sensor: AidingSensor) -> dict[str, Row]:
 class SensorMessages:
     """Converts the messages of one sensor, in the order of their stamps, to samples.
 
-    Attributes
-    ----------
-    without_value : int
-        Messages left out so far.
+    Attribute `without_value`: messages left out so far.
     """
 
     def __init__(self, sensor: AidingSensor) -> None:

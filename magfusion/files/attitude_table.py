@@ -29,24 +29,12 @@ _COLUMNS = (*_FIELD, *_RPY)
 
 @dataclass(frozen=True, eq=False)
 class AttitudeDatabase:
-    """Field vectors of one place, and the attitude at which each was measured.
+    """Field vectors of one place, and the attitude at which each was measured."""
 
-    Parameters
-    ----------
-    field_body : ndarray, shape (n, 3)
-        (T), calibrated.
-    rpy : ndarray, shape (n, 3)
-        Roll, pitch, yaw (rad): ``world_from_body = Rz(yaw) Ry(pitch) Rx(roll)``.
-    angles : {"roll", "roll-pitch"}
-        What varies; the others have one value throughout.
-    source : str
-        Log from which it was built.
-    """
-
-    field_body: Array
-    rpy: Array
-    angles: Angles
-    source: str
+    field_body: Array  # (n, 3) (T), calibrated
+    rpy: Array  # (n, 3), roll, pitch, yaw (rad): ``world_from_body = Rz(yaw) Ry(pitch) Rx(roll)``
+    angles: Angles  # what varies; the others have one value throughout
+    source: str  # log from which it was built
 
     def __len__(self) -> int:
         return len(self.field_body)

@@ -36,29 +36,15 @@ Channel = Annotated[int, Field(ge=0, le=1023)]
 
 
 class AudioEntry(StrictModel):
-    """Key ``audio`` of ``log.yaml``.
+    """Key ``audio`` of ``log.yaml``."""
 
-    Parameters
-    ----------
-    file : str
-        Path, from the log's directory if relative.
-    channels : dict
-        Channel of each axis of the receiver, counted from 0.
-    full_scale_v : float
-        Voltage of a sample of 1 (V).
-    rate_hz : float
-        Of the samples on the log's clock.
-    begin_ns : int
-        Stamp of the first sample.
-    slips : list of [int, int]
-        Of each place where samples are lost: number of the first sample after it, and of the lost.
-    """
-
-    file: str
+    file: str  # path, from the log's directory if relative
+    # channel of each axis of the receiver, counted from 0
     channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1)
-    full_scale_v: float = Field(gt=0.0, le=1e6)
-    rate_hz: float = Field(ge=1.0, le=1e7)
-    begin_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+    full_scale_v: float = Field(gt=0.0, le=1e6)  # voltage of a sample of 1 (V)
+    rate_hz: float = Field(ge=1.0, le=1e7)  # of the samples on the log's clock
+    begin_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)  # stamp of the first sample
+    # of each place where samples are lost: number of the first sample after it, and of the lost
     slips: list[Annotated[list[Count], Field(min_length=2, max_length=2)]] = Field(
         default_factory=list
     )

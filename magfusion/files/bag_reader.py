@@ -37,17 +37,12 @@ class BagReader(AnyReader):
 
     Without an index the library refuses messages that are not in the order of their arrival, which
     those of several topics are not.
-
-    Attributes
-    ----------
-    unfinished : dict
-        Files that the recorder did not finish, by the place of their reader.
-    damage : list of str
-        Topics of which the messages that were read are fewer than the index counts: the library
-        passes over what it cannot read in a chunk; and databases of which some rows cannot be read.
     """
 
+    # files that the recorder did not finish, by the place of their reader
     unfinished: Mapping[int, Path] = {}
+    # topics of which the messages that were read are fewer than the index counts: the library
+    # passes over what it cannot read in a chunk; and databases of which some rows cannot be read
     damage: Sequence[str] = ()
 
     @property

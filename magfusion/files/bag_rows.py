@@ -38,21 +38,11 @@ _LITTLE_ENDIAN = 1
 
 
 class Tail(NamedTuple):
-    """The doubles that a message ends with.
+    """The doubles that a message ends with."""
 
-    Parameters
-    ----------
-    numbers : int
-        How many there are.
-    read_rows : tuple of int
-        Which make a row.
-    absent : tuple of int
-        In which -1 marks a missing measurement.
-    """
-
-    numbers: int
-    read_rows: tuple[int, ...]
-    absent: tuple[int, ...] = ()
+    numbers: int  # how many there are
+    read_rows: tuple[int, ...]  # which make a row
+    absent: tuple[int, ...] = ()  # in which -1 marks a missing measurement
 
 
 _POSE = tuple(range(7))
@@ -69,21 +59,11 @@ TAILS: dict[str, Tail] = {
 
 
 class Wanted(NamedTuple):
-    """Messages to read.
+    """Messages to read."""
 
-    Parameters
-    ----------
-    place : str
-        What a refusal calls them.
-    connections : sequence of Connection
-        Of one topic and type.
-    row : callable
-        From a message to its numbers.
-    """
-
-    place: str
-    connections: Sequence[Connection]
-    row: Row
+    place: str  # what a refusal calls them
+    connections: Sequence[Connection]  # of one topic and type
+    row: Row  # from a message to its numbers
 
 
 class Messages(NamedTuple):

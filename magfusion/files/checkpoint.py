@@ -36,21 +36,11 @@ _REMEDY = "move it away, or give another path"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where a run was.
+    """Where a run was."""
 
-    Parameters
-    ----------
-    key : str
-        Of the run (`run_key`): only a run of the same key may go on from here.
-    position : int
-        Pieces of its input that were taken in.
-    content : dict
-        Plain data.
-    """
-
-    key: str
-    position: int
-    content: dict[str, Any]
+    key: str  # of the run (`run_key`): only a run of the same key may go on from here
+    position: int  # pieces of its input that were taken in
+    content: dict[str, Any]  # plain data
 
 
 def run_key(*identity: object) -> str:

@@ -41,10 +41,7 @@ def read_imu(
 ) -> tuple[ImuSamples, tuple[Finding, ...]]:
     """Read and check inertial samples; ``content`` as in `read_table`.
 
-    Returns
-    -------
-    ImuSamples, tuple of Finding
-        Without rows that hold NaN or of repeated time, and their number.
+    Rows that hold NaN or of repeated time are omitted; the findings have their number.
     """
     table = read_table(path, IMU_LAYOUT, span, content)
     if not len(table):
@@ -68,12 +65,8 @@ def read_waveform(
 ) -> tuple[Waveform | None, tuple[Finding, ...]]:
     """Read and check magnetometer samples; ``content`` as in `read_table`.
 
-    A receiver of fewer axes leaves columns out.
-
-    Returns
-    -------
-    Waveform or None, tuple of Finding
-        As `read_imu`; None where there is no file or no row within the span.
+    A receiver of fewer axes leaves columns out. Omits rows as `read_imu`; returns
+    None where there is no file or no row within the span.
     """
     if path is None:
         return None, ()

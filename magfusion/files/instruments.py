@@ -139,23 +139,13 @@ class ImuSheet:
 
 @dataclass(frozen=True)
 class MagnetometerSheet:
-    """One magnetometer.
-
-    Parameters
-    ----------
-    noise_density : float
-        One-sided (T/sqrt(Hz)).
-    offset : float
-        Of the sensor and of iron on the body, one sigma (T).
-    scale : float
-        Of gains and axes, relative, one sigma.
-    """
+    """One magnetometer."""
 
     name: str
     source: str
-    noise_density: float
-    offset: float
-    scale: float
+    noise_density: float  # one-sided (T/sqrt(Hz))
+    offset: float  # of the sensor and of iron on the body, one sigma (T)
+    scale: float  # of gains and axes, relative, one sigma
 
 
 def bias_walk(density: float, in_run: float | None) -> float:

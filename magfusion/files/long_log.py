@@ -31,18 +31,8 @@ _COLUMNS = {"imu": 6, "magnetometer": 3}
 class Samples:
     """A raw stream, taken up to one time after the other; what is no sample is left out.
 
-    Parameters
-    ----------
-    place : str
-        What a refusal calls it.
-    source : iterator of SampleBlock
-    columns : int
-        Of a row.
-
-    Attributes
-    ----------
-    first : float, optional
-        When it begins (s); None of one without samples.
+    `place`: what a refusal calls it. `columns`: of a row. Attribute `first`: when it begins (s);
+    None of one without samples.
     """
 
     def __init__(self, place: str, source: Iterator[SampleBlock], columns: int) -> None:

@@ -32,11 +32,8 @@ def read_waveforms(
 ) -> tuple[dict[str, Waveform], tuple[Finding, ...]]:
     """Read and check the samples of several magnetometers, by name, each by its own stamps.
 
-    Returns
-    -------
-    dict, tuple of Finding
-        As `magfusion.files.inertial_tables.read_waveform`, of each; those without a row within the
-        span are not there.
+    Each as from `magfusion.files.inertial_tables.read_waveform`; those without a row within the
+    span are omitted.
     """
     assert path is not None
     others = [n for n in column_names(path) if n == SLOT]

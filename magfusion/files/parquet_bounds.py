@@ -47,12 +47,7 @@ def read_batches(
     """Return the rows of a span of a file with more rows than are kept in memory.
 
     `skipped`: rows of the file before these groups. Raises InputError where the span has too many
-    rows, too.
-
-    Returns
-    -------
-    pyarrow.Table, int
-        And in which row of the file it begins.
+    rows, too. Returns also in which row of the file the table begins.
     """
     begin, end = bounds_ns
     kept: list[pa.RecordBatch] = []

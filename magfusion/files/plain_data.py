@@ -19,20 +19,13 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class Rules:
-    """Rules for some types in addition to their annotations.
+    """Rules for some types in addition to their annotations."""
 
-    Parameters
-    ----------
-    writers : mapping
-        By type, of which the own may be derived, how its plain data are made of it.
-    readers : mapping
-        By type, how it is made of its plain data; a `ValueError` has the reason.
-    checks : mapping
-        By type, what is to be seen when one was made; a `ValueError` has the reason.
-    """
-
+    # by type, of which the own may be derived, how its plain data are made of it
     writers: Mapping[type, Callable[[Any], Any]] = field(default_factory=dict)
+    # by type, how it is made of its plain data; a `ValueError` has the reason
     readers: Mapping[type, Callable[[Any], Any]] = field(default_factory=dict)
+    # by type, what is to be seen when one was made; a `ValueError` has the reason
     checks: Mapping[type, Callable[[Any], None]] = field(default_factory=dict)
 
     def writer(self, kind: type) -> Callable[[Any], Any] | None:

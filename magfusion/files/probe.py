@@ -20,12 +20,8 @@ def read_probe(path: Path) -> dict[Side, ProbeReadings]:
     """Read and check what a probe of one or three axes read, in Parquet or CSV.
 
     Raises InputError where a column is missing or of the wrong type, a number is not finite, a coil
-    is none of three, an axis has no direction, or a sigma is not positive.
-
-    Returns
-    -------
-    dict
-        Readings of the antennas next to which it was placed.
+    is none of three, an axis has no direction, or a sigma is not positive. Returns the readings by
+    the antenna next to which it was placed.
     """
     table = read_whole(path, "table of probe readings")
     coil = integers(table, "coil", path)

@@ -20,24 +20,12 @@ VERDICT = "verdict"
 
 @dataclass(frozen=True, eq=False)
 class ResultStates:
-    """States that have a pose.
+    """States that have a pose."""
 
-    Parameters
-    ----------
-    stamp_ns : ndarray of int, shape (n,)
-        As the file has them: the log's epoch is within.
-    trajectory : Trajectory
-        The same states, in seconds since the first.
-    columns : pyarrow.Table
-        All that the file holds of them.
-    left_out : int
-        States of the file whose verdict is failed: their poses are none.
-    """
-
-    stamp_ns: IntArray
-    trajectory: Trajectory
-    columns: pa.Table
-    left_out: int
+    stamp_ns: IntArray  # (n,), as the file has them: the log's epoch is within
+    trajectory: Trajectory  # the same states, in seconds since the first
+    columns: pa.Table  # all that the file holds of them
+    left_out: int  # states of the file whose verdict is failed: their poses are none
 
 
 def read_result_states(path: Path) -> ResultStates:

@@ -19,12 +19,8 @@ def separate_stamps(time_ns: IntArray, values: Array) -> IntArray | None:
 
     A stamp is that of the last sample, as where a driver reads a buffer; of a coarse clock it is
     not. `time_ns` (n,): sorted stamps (ns). `values` (n, columns): rows that repeat the numbers of
-    the one above are no other samples.
-
-    Returns
-    -------
-    ndarray of int, shape (n,), or None
-        Strictly increasing (ns); the last sample of a batch keeps its stamp.
+    the one above are no other samples. Returns strictly increasing stamps, shape (n,) (ns), or
+    None; the last sample of a batch keeps its stamp.
     """
     twice = np.diff(time_ns) == 0
     if not len(twice) or np.mean(twice) <= MOST_TWICE:

@@ -14,10 +14,7 @@ from magfusion.model.without_imu import on_motion_prior
 def changed_keys(before: Site, after: Site) -> dict[str, Any]:
     """Return the keys of a site's file whose values differ, as ``beacons[0].position_m``.
 
-    Returns
-    -------
-    dict
-        With the values of the second site; None for a key that it does not have.
+    The values are those of the second site; None for a key that it does not have.
     """
     old, new = (_flat(site_content(site)) for site in (before, after))
     return {key: new.get(key) for key in {**old, **new} if old.get(key) != new.get(key)}

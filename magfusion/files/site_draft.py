@@ -18,25 +18,17 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class BeaconDraft:
-    """Given values of a beacon; None for others.
-
-    Parameters
-    ----------
-    frequency_hz, moment_a_m2 : tuple of float, optional
-        One for all coils, or one a coil.
-    axes : str, optional
-        Beacon axis of each coil, as ``xy``; the second of two runs a quarter period behind.
-    radius_m : float, optional
-        Of every coil.
-    """
+    """Given values of a beacon; None for others."""
 
     name: str
     position_m: Numbers | None = None
     rpy_deg: Numbers | None = None
+    # frequency_hz, moment_a_m2: one for all coils, or one a coil
     frequency_hz: Numbers | None = None
     moment_a_m2: Numbers | None = None
+    # beacon axis of each coil, as ``xy``; the second of two runs a quarter period behind
     axes: str | None = None
-    radius_m: float | None = None
+    radius_m: float | None = None  # of every coil
     synchronised: bool | None = None
 
     @property

@@ -23,10 +23,6 @@ SQUARE = 1e-3  # cosine; beyond it two directions are not across each other
 _Speed = Annotated[float, Field(gt=0.0, le=100.0)]
 
 
-def _first_axis() -> Array:
-    return np.array([1.0, 0.0, 0.0])
-
-
 class HarmonicEntry(StrictModel):
     """`magfusion.model.rotor.Harmonic`."""
 
@@ -40,7 +36,7 @@ class RotorEntry(StrictModel):
 
     moment_a_m2: Annotated[float, between(SMALLEST_MOMENT, LARGEST_MOMENT)]
     axis: Annotated[Array, array(3), AfterValidator(a_direction)] = Field(
-        default_factory=_first_axis
+        default_factory=lambda: np.array([1.0, 0.0, 0.0])
     )
     zero: Annotated[Array, array(3), AfterValidator(a_direction)] = Field(
         default_factory=lambda: np.array([0.0, 0.0, 1.0])

@@ -29,31 +29,15 @@ _POSE = (*POSITION, *QUATERNION)
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Fields at surveyed points; a channel is one tone of one beacon, NaN where it is missing.
+    """Fields at surveyed points; a channel is one tone of one beacon, NaN where it is missing."""
 
-    Parameters
-    ----------
-    point : ndarray of int, shape (n,)
-        Number of each point.
-    position_world : ndarray, shape (n, 3)
-        (m)
-    world_from_body : ndarray, shape (n, 3, 3)
-    channels : tuple of (str, int)
-        Beacon name and tone.
-    sigma : ndarray, shape (n, channels)
-        Standard deviation of each component, or of the amplitude (T).
-    phasor_sensor : complex ndarray, shape (n, channels, 3), optional
-        (T)
-    amplitude : ndarray, shape (n, channels), optional
-        Root mean square of the field over time (T), in a survey that holds no phasors.
-    """
-
-    point: IntArray
-    position_world: Array
-    world_from_body: Array
-    channels: tuple[tuple[str, int], ...]
-    sigma: Array
-    phasor_sensor: ComplexArray | None = None
+    point: IntArray  # (n,), number of each point
+    position_world: Array  # (n, 3) (m)
+    world_from_body: Array  # (n, 3, 3)
+    channels: tuple[tuple[str, int], ...]  # beacon name and tone
+    sigma: Array  # (n, channels), standard deviation of each component, or of the amplitude (T)
+    phasor_sensor: ComplexArray | None = None  # (n, channels, 3) (T)
+    # (n, channels), root mean square of the field over time (T), in a survey that holds no phasors
     amplitude: Array | None = None
 
     def __post_init__(self) -> None:

@@ -71,31 +71,18 @@ class Span:
 
 
 class TableLayout(NamedTuple):
-    """Columns of a table.
+    """Columns of a table."""
 
-    Parameters
-    ----------
-    numbers, integers, texts : tuple of str
-        Columns that must be there.
-    optional : tuple of tuple of str
-        Groups of columns with numbers: each whole or absent.
-    repeats : bool
-        Whether several rows may have the same time.
-    some : tuple of str
-        Columns with numbers, of which one at least must be there.
-    optional_texts : tuple of str
-        Columns of text that may be there.
-    strays : bool
-        Whether single rows with stamps far from all others are left out, and not refused.
-    """
-
+    # numbers, integers, texts: columns that must be there
     numbers: tuple[str, ...]
     integers: tuple[str, ...] = (TIME,)
     texts: tuple[str, ...] = ()
+    # groups of columns with numbers: each whole or absent
     optional: tuple[tuple[str, ...], ...] = ()
-    repeats: bool = False
-    some: tuple[str, ...] = ()
-    optional_texts: tuple[str, ...] = ()
+    repeats: bool = False  # whether several rows may have the same time
+    some: tuple[str, ...] = ()  # columns with numbers, of which one at least must be there
+    optional_texts: tuple[str, ...] = ()  # columns of text that may be there
+    # whether single rows with stamps far from all others are left out, and not refused
     strays: bool = False
 
     def _wanted(self, result: Sequence[str]) -> list[str]:
@@ -129,26 +116,14 @@ class TableLayout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of a table within a span, not yet checked but for its times.
-
-    Parameters
-    ----------
-    data : pyarrow.Table
-    time_ns : ndarray of int, shape (n,)
-        Sorted; strictly increasing unless the layout lets them repeat.
-    time : ndarray, shape (n,)
-        The same in seconds since the log's epoch.
-    first_row : int
-        Row of the file, counted from 0, with which the span begins.
-    stray : tuple of tuple of int
-        Rows of the file that were left out, and their stamps (ns).
-    """
+    """Rows of a table within a span, not yet checked but for its times."""
 
     path: Path
     data: pa.Table
-    time_ns: IntArray
-    time: Array
-    first_row: int
+    time_ns: IntArray  # (n,), sorted; strictly increasing unless the layout lets them repeat
+    time: Array  # (n,), the same in seconds since the log's epoch
+    first_row: int  # row of the file, counted from 0, with which the span begins
+    # rows of the file that were left out, and their stamps (ns)
     stray: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:

@@ -59,27 +59,15 @@ class Bench:
 
 @dataclass(frozen=True, eq=False)
 class AntennaSolution:
-    """The antennas of a bench.
-
-    Parameters
-    ----------
-    prior : ndarray, shape (k,)
-        Mean before the survey: from the site and the probe.
-    root : ndarray, shape (k, k)
-        Factor of its covariance.
-    observed : AntennaObservability, optional
-        What the survey's poses determine.
-    probed : dict
-        Relative leave-one-out errors of readings, before and after.
-    elsewhere : ndarray, shape (2,), optional
-        Predicted errors of fixes in attitudes that were not surveyed (rad, m).
-    """
+    """The antennas of a bench."""
 
     fit: AntennaFit
-    prior: Array
-    root: Array
-    observed: AntennaObservability | None
+    prior: Array  # (k,), mean before the survey: from the site and the probe
+    root: Array  # (k, k), factor of its covariance
+    observed: AntennaObservability | None  # what the survey's poses determine
+    # relative leave-one-out errors of readings, before and after
     probed: dict[Side, tuple[Array, Array]] = field(default_factory=dict)
+    # (2,), predicted errors of fixes in attitudes that were not surveyed (rad, m)
     elsewhere: Array | None = None
 
 

@@ -69,28 +69,15 @@ class DatabaseSettings(LogSettings, Sampling):
 
 
 class Steady(NamedTuple):
-    """The calibrated static field of a log.
+    """The calibrated static field of a log."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    field_body : ndarray, shape (n, 3)
-        (T)
-    force_body : ndarray, shape (n, 3), optional
-        Mean specific force (m/s^2); None for raw samples.
-    sigma, force_sigma : float
-        White noise of each component (T, m/s^2).
-    length : float
-        Of a window (s).
-    """
-
-    time: Array
-    field_body: Array
-    force_body: Array | None
+    time: Array  # (n,) (s)
+    field_body: Array  # (n, 3) (T)
+    force_body: Array | None  # (n, 3), mean specific force (m/s^2); None for raw samples
+    # sigma, force_sigma: white noise of each component (T, m/s^2)
     sigma: float
     force_sigma: float
-    length: float
+    length: float  # of a window (s)
 
 
 def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:

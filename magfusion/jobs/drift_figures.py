@@ -48,16 +48,9 @@ _STARTED = 60.0  # s
 
 @dataclass(frozen=True)
 class Criterion:
-    """One criterion and its verdict.
+    """One criterion and its verdict."""
 
-    Parameters
-    ----------
-    name : str
-        Of its verdict in the report.
-    verdict : {'pass', 'fail', 'undecided'}
-    """
-
-    name: str
+    name: str  # of its verdict in the report
     verdict: Verdict
     sentence: str
 

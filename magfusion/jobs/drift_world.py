@@ -54,26 +54,17 @@ _PROGRESS, _ERROR_ROWS, _PACE_ROWS = "progress.bin", "errors.rows", "pace.rows"
 
 @dataclass(frozen=True)
 class WorldTask:
-    """One run.
-
-    Parameters
-    ----------
-    phase_known : bool
-        Whether the drives are declared synchronised; otherwise each beacon has a clock of its own.
-    clock_rate : float
-        Relative error of the clock that all drives share.
-    place : str, optional
-        Directory of the files needed to resume; None stores nothing.
-    """
+    """One run."""
 
     world: int
     estimator: Estimator
     hours: float
     seed: int
     drive: str = "current"
+    # whether the drives are declared synchronised; otherwise each beacon has a clock of its own
     phase_known: bool = False
-    clock_rate: float = 0.0
-    place: str | None = None
+    clock_rate: float = 0.0  # relative error of the clock that all drives share
+    place: str | None = None  # directory of the files needed to resume; None stores nothing
 
     @property
     def progress(self) -> Path:
@@ -94,27 +85,17 @@ class WorldTask:
 
 @dataclass(frozen=True, eq=False)
 class WorldRun:
-    """Result of a run.
-
-    Parameters
-    ----------
-    errors : ErrorSeries
-        Of all states.
-    pace : ndarray, shape (pieces, 6)
-        Of each piece the columns `PACE`: begin, processor time (s), number of states, resident
-        memory (MiB), mean squared innovation relative to its expectation, processor time of the
-        bare loop for one sample in the same minutes (s), which removes the machine's load.
-    bare_seconds : float
-        Processor time of a bare loop over ``integrateMeasurement`` on all samples, extrapolated.
-    losses : dict of str to int
-        Counts of refused, lost and recovered epochs.
-    """
+    """Result of a run."""
 
     task: WorldTask
-    errors: ErrorSeries
+    errors: ErrorSeries  # of all states
+    # (pieces, 6), of each piece the columns `PACE`: begin, processor time (s), number of states,
+    # resident memory (MiB), mean squared innovation relative to its expectation, processor time of
+    # the bare loop for one sample in the same minutes (s), which removes the machine's load
     pace: Array
+    # processor time of a bare loop over ``integrateMeasurement`` on all samples, extrapolated
     bare_seconds: float
-    losses: dict[str, int]
+    losses: dict[str, int]  # counts of refused, lost and recovered epochs
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,7 @@ def failed_figures(
     """Return the figures of a job that raised, and write them to its output.
 
     `job`, `log`: as in the heading of a report. `written`: whether the job has written its report
-    itself.
-
-    Returns
-    -------
-    Figures, optional
-        None where the report cannot be written.
+    itself. Returns None where the report cannot be written.
     """
     if written:
         return _read(output / "report.json")

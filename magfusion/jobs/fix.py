@@ -133,15 +133,9 @@ def run_fix(
 ) -> Figures:
     """Fix the pose at every epoch on its own: every hypothesis, best first.
 
-    Parameters
-    ----------
-    free_parameters : tuple of str
-        Parameters estimated with the pose in any case, as in
-        `magfusion.estimation.snapshot.explained_fixes`.
-    risk : Risk, optional
-        Specification of the protection levels.
-    rest : RestSettings, optional
-        Settings by which each rest is one epoch.
+    `free_parameters`: parameters estimated with the pose in any case, as in
+    `magfusion.estimation.snapshot.explained_fixes`. `risk`: specification of the protection levels.
+    `rest`: settings by which each rest is one epoch.
     """
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.inputs import named
@@ -285,14 +279,8 @@ def write_fix_result(
 ) -> Figures:
     """Write the fixes; return the figures with the errors against the truth.
 
-    Parameters
-    ----------
-    relation : ndarray of str, optional
-        As in `write_hypotheses`, if not that of the symmetries.
-    columns : mapping, optional
-        Additional columns.
-    nearest : Trajectory, optional
-        Trajectory compared with the truth, if not that of the best hypotheses.
+    `relation`: as in `write_hypotheses`, if not that of the symmetries. `columns`: additional
+    columns. `nearest`: trajectory compared with the truth, if not that of the best hypotheses.
     """
     from magfusion.results.axes import axis_figures
     from magfusion.results.page_motion import MotionPage

@@ -34,25 +34,17 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class FoundCoil:
-    """Poses of a receiver of one axis, with their findings.
+    """Poses of a receiver of one axis, with their findings."""
 
-    Parameters
-    ----------
-    log : Log
-        With the truth rotated to the selected roll.
-    columns : dict
-        Additional columns of the hypotheses' table, shape (n, hypotheses) each.
-    compared : Trajectory, optional
-        Of the reported positions nearest to the truth, with their own covariance.
-    """
-
-    log: Log
+    log: Log  # with the truth rotated to the selected roll
     fixes: Fixes
     states: StateTrust
     trust: Trust
     figures: Figures
     relation: NDArray[np.str_]
+    # additional columns of the hypotheses' table, shape (n, hypotheses) each
     columns: dict[str, Array]
+    # of the reported positions nearest to the truth, with their own covariance
     compared: Trajectory | None = None
 
 

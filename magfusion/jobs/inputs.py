@@ -36,29 +36,16 @@ from magfusion.receiver.windows import LockinSettings
 
 @dataclass(frozen=True)
 class Job:
-    """Inputs of every job on a log.
-
-    Parameters
-    ----------
-    site_path : Path, optional
-        By default ``site.yaml`` in the log's directory.
-    output : Path
-        Directory of the results; an earlier result there is moved to the next free name.
-    start, end : float, optional
-        Part of the log to use, seconds since its epoch.
-    topics : Topics, optional
-        Of a bag with several of one type.
-    where : Where
-        Constraint on the magnetometer's position, in addition to the site's.
-    """
+    """Inputs of every job on a log."""
 
     log_path: Path
-    site_path: Path | None
-    output: Path
+    site_path: Path | None  # by default ``site.yaml`` in the log's directory
+    output: Path  # directory of the results; an earlier result there is moved to the next free name
+    # start, end: part of the log to use, seconds since its epoch
     start: float | None = None
     end: float | None = None
-    topics: Topics | None = None
-    where: Where = ANYWHERE
+    topics: Topics | None = None  # of a bag with several of one type
+    where: Where = ANYWHERE  # constraint on the magnetometer's position, in addition to the site's
 
     @property
     def declared_path(self) -> Path:
@@ -104,14 +91,8 @@ def read_site(
 ) -> Site:
     """Read the site of a job.
 
-    Parameters
-    ----------
-    unknown : bool
-        Whether the job accepts beacons that were never surveyed.
-    without : bool
-        Whether it accepts a site without beacons.
-    several : bool
-        Whether it accepts several magnetometers.
+    `unknown`: whether the job accepts beacons that were never surveyed. `without`: whether it
+    accepts a site without beacons. `several`: whether it accepts several magnetometers.
     """
     if job.site_path is None and not job.declared_path.is_file():
         # A missing log is the more direct cause.

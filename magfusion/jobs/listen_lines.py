@@ -84,20 +84,9 @@ class _Counted:
 class LineSource:
     """A serial port or UDP socket with records.
 
-    Raises InputError where the place is none.
-
-    Parameters
-    ----------
-    place : str
-        ``serial:PORT[@BAUD]`` or ``udp:PORT``.
-    scales : mapping
-        As of `scales_of`.
-    encoding : {"lines", "frames"}
-
-    Attributes
-    ----------
-    faults : Counter
-        Records by kind and fault: lost, doubled, late, garbled, restarted.
+    Raises InputError where the place is none. `place`: ``serial:PORT[@BAUD]`` or ``udp:PORT``.
+    `scales`: as of `scales_of`. Attribute `faults`: records by kind and fault: lost, doubled, late,
+    garbled, restarted.
     """
 
     def __init__(

@@ -217,10 +217,7 @@ def run_rests_stream(
 ) -> int:
     """Navigate rests from the records of a stream; one line of JSON for each state.
 
-    Returns
-    -------
-    int
-        Number of skipped records.
+    Returns the number of skipped records.
     """
     navigator, samples = how.navigator(site), StreamSamples(site)
 

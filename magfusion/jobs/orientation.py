@@ -42,14 +42,8 @@ from magfusion.units import DEGREE, MICROTESLA, Array, Rate
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
     """Estimate the orientation of a log: trajectory, report, recording, and the estimated site.
 
-    Parameters
-    ----------
-    name : {'smooth', 'navigate'}
-    rate : 'field', 'imu' or float
-        Without beacons there are no field epochs: states are at every inertial sample, or so many
-        a second (Hz).
-    back : bool
-        Whether later samples are used too.
+    `rate`: without beacons there are no field epochs: states are at every inertial sample, or so
+    many a second (Hz). `back`: whether later samples are used too.
     """
     claimed = claim(job.output, name)
     log, site = read_job(job, without=True, report=report)
@@ -180,10 +174,7 @@ def run_orientation_stream(
 ) -> int:
     """Write the orientation for the records of a stream; a line of JSON per inertial sample.
 
-    Returns
-    -------
-    int
-        Number of skipped records.
+    Returns the number of skipped records.
     """
     navigator = OrientationNavigator(site)
     samples = StreamSamples(site, patient=False)  # each sample has a state

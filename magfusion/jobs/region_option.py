@@ -20,18 +20,10 @@ LARGEST = 1e6  # m
 
 @dataclass(frozen=True)
 class Where:
-    """The user's constraint on the position, in addition to the site's.
+    """The user's constraint on the position, in addition to the site's."""
 
-    Parameters
-    ----------
-    hemisphere : tuple of str
-        ``[BEACON=]DIRECTION`` each.
-    region : str, optional
-        ``xmin,xmax,ymin,ymax,zmin,zmax``.
-    """
-
-    hemisphere: tuple[str, ...] = ()
-    region: str | None = None
+    hemisphere: tuple[str, ...] = ()  # ``[BEACON=]DIRECTION`` each
+    region: str | None = None  # ``xmin,xmax,ymin,ymax,zmin,zmax``
 
     def bounded(self, site: Site) -> Site:
         """Return the site with the constraints."""

@@ -45,26 +45,15 @@ PIECE = 0.05  # s
 
 @dataclass(frozen=True, eq=False)
 class Packet:
-    """Data that arrive together.
+    """Data that arrive together."""
 
-    Parameters
-    ----------
-    arrival : float
-        End of the last measurement (s).
-    fields : tuple of FieldSamples
-        One epoch each.
-    waveforms : tuple of (str, Waveform)
-        Of several magnetometers, those with samples or marks in it.
-    aiding : tuple of (str, AidingSamples)
-        Of the aiding sensors with samples in it.
-    """
-
-    arrival: float
+    arrival: float  # end of the last measurement (s)
     imu: ImuSamples
     waveform: Waveform | None
-    fields: tuple[FieldSamples, ...]
+    fields: tuple[FieldSamples, ...]  # one epoch each
+    # of several magnetometers, those with samples or marks in it
     waveforms: tuple[tuple[str, Waveform], ...] = ()
-    aiding: tuple[tuple[str, AidingSamples], ...] = ()
+    aiding: tuple[tuple[str, AidingSamples], ...] = ()  # of the aiding sensors with samples in it
 
     @property
     def waves(self) -> Iterator[tuple[str | None, Waveform]]:

@@ -99,14 +99,7 @@ def simulate_ranging(
 ) -> Figures:
     """Simulate the record of a sensor in a well during passes of a magnet in another.
 
-    Parameters
-    ----------
-    site : Site
-        As `is_for_ranging`.
-    rate_hz : float, optional
-        Of the magnetometer.
-    neighbour : tuple of Pipe
-        Steel near the wells.
+    `site`: as `is_for_ranging`. `rate_hz`: of the magnetometer. `neighbour`: steel near the wells.
     """
     from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report

@@ -45,34 +45,16 @@ WAITING = 1.0  # s; before the first state, as often a sign of life
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """Settings of a stream.
-
-    Parameters
-    ----------
-    form : {"json", "msgpack"}
-        Of the records.
-    keep_going : bool
-        Count and skip invalid records.
-    live : LiveSettings
-        Other outputs of the states.
-    checkpoint : Path, optional
-        Checkpoint file.
-    every : float
-        Interval of checkpoints (s of the stream).
-    resume : bool
-        Resume from the checkpoint, if there is one, with the next data.
-    where : Where
-        Constraint on the magnetometer's position, in addition to the site's.
-    """
+    """Settings of a stream."""
 
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
-    form: Format = "json"
-    keep_going: bool = False
-    live: LiveSettings = field(default_factory=LiveSettings)
-    checkpoint: Path | None = None
-    every: float = 30.0
-    resume: bool = False
-    where: Where = ANYWHERE
+    form: Format = "json"  # of the records
+    keep_going: bool = False  # count and skip invalid records
+    live: LiveSettings = field(default_factory=LiveSettings)  # other outputs of the states
+    checkpoint: Path | None = None  # checkpoint file
+    every: float = 30.0  # interval of checkpoints (s of the stream)
+    resume: bool = False  # resume from the checkpoint, if there is one, with the next data
+    where: Where = ANYWHERE  # constraint on the magnetometer's position, in addition to the site's
 
 
 def run_stream(
@@ -81,12 +63,7 @@ def run_stream(
     """Navigate from the records of a stream; write one line of JSON for each state.
 
     `source`, `sink`: binary; each line is flushed. `messages`: receives messages on skipped
-    records.
-
-    Returns
-    -------
-    int
-        Number of skipped records.
+    records. Returns the number of skipped records.
     """
     records = read_records(source, settings.form)
     return navigate_records(site_path, settings, records, sink, messages)
@@ -171,12 +148,8 @@ def _navigate(
 class _StateWriter:
     """Writes states as they are estimated, and sends them to the other outputs.
 
-    `sink`: binary.
-
-    Attributes
-    ----------
-    reference : bool
-        Whether samples of a reference sensor have arrived, which are not used here.
+    `sink`: binary. Attribute `reference`: whether samples of a reference sensor have arrived, which
+    are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:

@@ -123,21 +123,9 @@ def interpolate(
     """Interpolate the poses at those of ``time`` that lie on a sample or in a short enough step.
 
     Positions are interpolated linearly, attitudes along the shortest rotation (slerp); other parts
-    of the trajectory are omitted.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Strictly increasing (s).
-    max_gap : float
-        Longest step of the trajectory to interpolate across (s).
-
-    Returns
-    -------
-    poses : Trajectory
-        At the m times that exist.
-    exists : ndarray of bool, shape (n,)
-        Which of ``time`` have a pose.
+    of the trajectory are omitted. `time` (n,): strictly increasing (s). `max_gap`: longest step of
+    the trajectory to interpolate across (s). Returns `poses`: at the m times that exist;
+    `exists` (n,): which of ``time`` have a pose.
     """
     known = trajectory.time
     if len(known) == 0:

@@ -25,21 +25,10 @@ def truth_poses(
 ) -> tuple[Trajectory, BoolArray, str]:
     """Interpolate a truth of any rate at those times where its motion allows it.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Strictly increasing (s).
-    any_motion : bool
-        Whether only gaps are not interpolated across, whatever the error.
-
-    Returns
-    -------
-    poses : Trajectory
-        At the m times that the truth covers; a part that the truth lacks is NaN.
-    covered : ndarray of bool, shape (n,)
-        Which times these are.
-    reason : str
-        Why others are not covered; empty where all are.
+    `time` (n,): strictly increasing (s). `any_motion`: whether only gaps are not interpolated
+    across, whatever the error. Returns `poses`: at the m times that the truth covers; a part that
+    the truth lacks is NaN; `covered` (n,): which times these are; `reason`: why others are not
+    covered; empty where all are.
     """
     known = truth.time
     if len(known) == 0 or len(time) == 0:

@@ -60,36 +60,17 @@ class Citation(StrictModel):
 
 
 class PaperEntry(StrictModel):
-    """One equation, table, figure or claim.
+    """One equation, table, figure or claim."""
 
-    Parameters
-    ----------
-    `says` : str
-        The paper's statement, in a few words.
-    where : str
-        The section, for entries without a printed number.
-    finding : str
-        One of `FINDINGS`.
-    why : str
-        The correction, the counter-example, or the missing information.
-    figures : str
-        The numbers that the paper prints, and those computed here.
-    functions : list of str
-        Callable functions; a name without dots is in the paper's ``equations``.
-    tests : list of str
-        Node ids of the tests that show it.
-    scenario : str, optional
-        The scenario file that shows it in full.
-    """
-
-    says: str
-    where: str = ""
-    finding: Finding
-    why: str = ""
-    figures: str = ""
+    says: str  # the paper's statement, in a few words
+    where: str = ""  # the section, for entries without a printed number
+    finding: Finding  # one of `FINDINGS`
+    why: str = ""  # the correction, the counter-example, or the missing information
+    figures: str = ""  # the numbers that the paper prints, and those computed here
+    # callable functions; a name without dots is in the paper's ``equations``
     functions: list[str] = Field(default_factory=list)
-    tests: list[str] = Field(default_factory=list)
-    scenario: str | None = None
+    tests: list[str] = Field(default_factory=list)  # node ids of the tests that show it
+    scenario: str | None = None  # the scenario file that shows it in full
 
     @model_validator(mode="after")
     def _check_declared(self) -> Self:
@@ -159,10 +140,7 @@ class Paper(StrictModel):
     def select(self, words: str) -> list[NumberedEntry]:
         """Return the entries selected by ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
 
-        Raises
-        ------
-        InputError
-            Where the paper has no such entry.
+        Raises InputError where the paper has no such entry.
         """
         parts = _QUERY.fullmatch(words.lower())
         if parts is None or not any(parts.groups()):
@@ -185,10 +163,7 @@ class Paper(StrictModel):
 def paper(name: str) -> Paper:
     """Return one of the papers of `ROOMS`, by its number or its DOI.
 
-    Raises
-    ------
-    InputError
-        Where there is no such paper.
+    Raises InputError where there is no such paper.
     """
     if name in ROOMS:
         return _read(name)

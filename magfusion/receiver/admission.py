@@ -30,28 +30,15 @@ ROUNDING = 1e-6  # of a step; tolerance for rounding of a window's limits
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Windows of a waveform that can be demodulated.
+    """Windows of a waveform that can be demodulated."""
 
-    Parameters
-    ----------
-    number : int ndarray, shape (n,)
-        Running number on the grid.
-    centre : ndarray, shape (n,)
-        (s)
-    first, count : int ndarray, shape (n,)
-        Samples of each window.
-    length : ndarray, shape (n,)
-        (s)
-    place : int ndarray, shape (n,)
-        Place in a cycle of slots; zero for windows of one kind.
-    """
-
-    number: IntArray
-    centre: Array
+    number: IntArray  # (n,), running number on the grid
+    centre: Array  # (n,) (s)
+    # first, count: (n,), samples of each window
     first: IntArray
     count: IntArray
-    length: Array
-    place: IntArray
+    length: Array  # (n,) (s)
+    place: IntArray  # (n,), place in a cycle of slots; zero for windows of one kind
 
     def __len__(self) -> int:
         return len(self.number)
@@ -75,31 +62,17 @@ class Windows:
 
 @dataclass(frozen=True)
 class WindowGrid:
-    """Windows of one length at a fixed step.
+    """Windows of one length at a fixed step."""
 
-    Parameters
-    ----------
-    centre : float
-        Centre of window 0 (s).
-    step, length : float
-        (s)
-    early : float
-        Time from the start of the first sample's interval to the start of the window (s).
-    rounding : float
-        Tolerance by which a time stamp may precede its window (s).
-    wait : float
-        Time after a window's end until its last sample has certainly arrived (s).
-    together : int
-        Windows assessed at once, when the last of them is complete.
-    """
-
-    centre: float
+    centre: float  # centre of window 0 (s)
+    # step, length (s)
     step: float
     length: float
+    # time from the start of the first sample's interval to the start of the window (s)
     early: float = 0.0
-    rounding: float = 0.0
-    wait: float = 0.0
-    together: int = 1
+    rounding: float = 0.0  # tolerance by which a time stamp may precede its window (s)
+    wait: float = 0.0  # time after a window's end until its last sample has certainly arrived (s)
+    together: int = 1  # windows assessed at once, when the last of them is complete
 
     def last(self, until: float) -> int:
         """Return the number of the last window that can be assessed at a time (s)."""
@@ -146,36 +119,19 @@ Growth = Callable[[Windows, Array], Array]
 
 @dataclass(eq=False)
 class Admission:
-    """Rules by which windows are admitted, applied in the order of their numbers.
+    """Rules by which windows are admitted, applied in the order of their numbers."""
 
-    Parameters
-    ----------
-    magnetometer_step, imu_step : float
-        Usual time between two samples (s).
-    imu_begin : float
-        Time of the first inertial sample (s).
-    imu_margin : float
-        How far a window may reach beyond the inertial samples (s).
-    clips : bool
-        Whether a constant extreme is saturation.
-    needs_turn : bool
-        Whether a window without inertial samples is dropped; otherwise its noise is larger.
-    least_share : float
-        Least share of its nominal samples that a window must hold.
-    slack : int
-        Samples by which windows may be offset from the sampling.
-    ends : tuple of RangeEnds
-        Range of each axis as observed so far.
-    """
-
+    # magnetometer_step, imu_step: usual time between two samples (s)
     magnetometer_step: float
     imu_step: float
-    imu_begin: float
-    imu_margin: float
-    clips: bool
+    imu_begin: float  # time of the first inertial sample (s)
+    imu_margin: float  # how far a window may reach beyond the inertial samples (s)
+    clips: bool  # whether a constant extreme is saturation
+    # whether a window without inertial samples is dropped; otherwise its noise is larger
     needs_turn: bool
-    least_share: float
-    slack: int = 0
+    least_share: float  # least share of its nominal samples that a window must hold
+    slack: int = 0  # samples by which windows may be offset from the sampling
+    # range of each axis as observed so far
     ends: tuple[RangeEnds, ...] = field(default_factory=lambda: tuple(RangeEnds() for _ in "xyz"))
 
     def verdicts(

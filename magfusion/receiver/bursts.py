@@ -18,12 +18,8 @@ MAX_SAMPLES = 32  # samples in a burst
 def spread_bursts(stamps: Array) -> Array | None:
     """Return sampling times of samples that arrived in bursts; None if they did not.
 
-    `stamps` (n,): strictly increasing (s).
-
-    Returns
-    -------
-    ndarray, shape (n,), or None
-        Strictly increasing (s); the last sample of a burst keeps its stamp.
+    `stamps` (n,): strictly increasing (s). Returns strictly increasing stamps, shape (n,)
+    (s), or None; the last sample of a burst keeps its stamp.
     """
     if len(stamps) < 2 * MAX_SAMPLES:
         return None

@@ -35,21 +35,11 @@ MARGIN = 2.0  # m; position error of the track
 
 
 class SensorPath(NamedTuple):
-    """Coarse track of the magnetometer, accurate to about one grid pitch.
+    """Coarse track of the magnetometer, accurate to about one grid pitch."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    position_world : ndarray, shape (n, 3)
-        (m)
-    spread : ndarray, shape (n,)
-        Distance of the farthest position that is nearly as probable (m).
-    """
-
-    time: Array
-    position_world: Array
-    spread: Array
+    time: Array  # (n,) (s)
+    position_world: Array  # (n, 3) (m)
+    spread: Array  # (n,), distance of the farthest position that is nearly as probable (m)
 
     def at(self, time: Array) -> tuple[Array, Array]:
         """Return the positions at times and their possible errors, (n, 3) and (n,) (m)."""

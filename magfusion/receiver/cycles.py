@@ -40,12 +40,8 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     The gyro rotates the fields to the mean time of the slots.  For a receiver that lacks axes,
     ``turned`` has that rotation instead.  The translation of the body within the cycle remains;
     ``ahead`` has the time of each measurement. `samples`: channels in the site's order. `site`:
-    with a schedule. Raises InputError where there is no such cycle.
-
-    Returns
-    -------
-    FieldSamples
-        The cycles that hold every channel.
+    with a schedule. Raises InputError where there is no such cycle. Returns the cycles that hold
+    every channel.
     """
     result = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
     whole: BoolArray = np.all(result.valid, axis=1)
@@ -62,14 +58,9 @@ def cycles(
 ) -> FieldSamples:
     """Join the available slots of each cycle to one row.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        As of `whole_cycles`; at least one.
-    measured_from_still : Turn
-        As from `magfusion.receiver.turn.turn_of`.
-    epoch : int ndarray, shape (n,), optional
-        The cycle of each row, increasing, where that is known.
+    `samples`: as of `whole_cycles`; at least one. `measured_from_still`: as from
+    `magfusion.receiver.turn.turn_of`. `epoch` (n,): the cycle of each row, increasing, where that
+    is known.
     """
     cycle = cycle_of(samples, site) if epoch is None else np.unique(epoch, return_inverse=True)[1]
     row, channel = np.nonzero(samples.valid)

@@ -24,55 +24,29 @@ WORST_CONDITION = 1e8  # of a normal matrix; beyond, its columns are not separab
 
 
 class Maps(NamedTuple):
-    """The maps of n windows, padded to m samples each.
+    """The maps of n windows, padded to m samples each."""
 
-    Parameters
-    ----------
-    sample : int ndarray, shape (n, m)
-        Number of each sample.
-    weight : bool ndarray, shape (n, m)
-        False where a row is padding.
-    elapsed : ndarray, shape (n, m)
-        Sample times from the centre of the window (s).
-    solver : ndarray, shape (n, 1 + 2 tones, m)
-        To the constant, the cosines and the sines.
-    variance : ndarray, shape (n, 1 + 2 tones)
-        Of these, for samples with a variance of one.
-    probes : ndarray, shape (n, tones, 4, m)
-        To the residuals of probes next to each tone, scaled to unit variance.
-    dimensions : int ndarray, shape (n, tones)
-        Number of independent probe directions of each tone.
-    """
-
-    sample: IntArray
-    weight: BoolArray
-    elapsed: Array
-    solver: Array
-    variance: Array
+    sample: IntArray  # (n, m), number of each sample
+    weight: BoolArray  # (n, m), False where a row is padding
+    elapsed: Array  # (n, m), sample times from the centre of the window (s)
+    solver: Array  # (n, 1 + 2 tones, m), to the constant, the cosines and the sines
+    variance: Array  # (n, 1 + 2 tones), of these, for samples with a variance of one
+    # (n, tones, 4, m), to the residuals of probes next to each tone, scaled to unit variance
     probes: Array
-    dimensions: IntArray
+    dimensions: IntArray  # (n, tones), number of independent probe directions of each tone
 
 
 @dataclass(frozen=True, eq=False)
 class Designs:
-    """The designs of windows.
-
-    Parameters
-    ----------
-    frequencies_hz, nuisance_hz : ndarray
-        Tones, and lines that are fitted with them (Hz).
-    time : ndarray, shape (samples,)
-        (s)
-    even : dict
-        Maps of single windows by the spacing of their evenly spaced samples: few spacings
-        recur.
-    """
+    """The designs of windows."""
 
     settings: LockinSettings
+    # frequencies_hz, nuisance_hz: tones, and lines that are fitted with them (Hz)
     frequencies_hz: Array
     nuisance_hz: Array
-    time: Array
+    time: Array  # (samples,) (s)
     windows: Windows
+    # maps of single windows by the spacing of their evenly spaced samples: few spacings recur
     even: dict[Spacing, Maps] = field(default_factory=dict)
     kept: dict[int, Maps] = field(default_factory=dict)
     requested: set[int] = field(default_factory=set)

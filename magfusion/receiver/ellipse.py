@@ -17,13 +17,8 @@ def plane_normal(phasor: ComplexArray) -> Array:
     instantaneous fields of the two coils and averages to zero, and Eq 8-9, a later field times an
     earlier one, give the opposite sign.  Of all pairs a quarter period apart the mean of ``B(t) x
     B(t + T/4)`` is this normal, and the phasors use the samples better than the pairs. `phasor`
-    (..., 3): (T), in any axes.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        (T^2), in the same axes; its length is the product of the semi-axes, zero for a field that
-        oscillates along a line.
+    (..., 3): (T), in any axes. Returns (..., 3) (T^2), in the same axes; its length is the product
+    of the semi-axes, zero for a field that oscillates along a line.
     """
     return np.asarray(np.cross(phasor.imag, phasor.real))
 
@@ -33,12 +28,7 @@ def semi_axes(phasor: ComplexArray) -> Array:
 
     Of two equal moments m in quadrature the minor one is ``K m / r^3`` in all directions, hence a
     range, and the major one ``sqrt(1 + 3 sin^2 phi)`` times that, phi from the rotation axis.
-    `phasor` (..., 3): (T), in any axes.
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        (T), minor first.
+    `phasor` (..., 3): (T), in any axes. Returns (..., 2) (T), minor first.
     """
     power = np.sum(np.abs(phasor) ** 2, axis=-1)
     major = np.sqrt(0.5 * (power + np.abs(np.sum(phasor**2, axis=-1))))
@@ -53,11 +43,6 @@ def rms_amplitude(phasor: ComplexArray) -> Array:
 
     Of two equal moments m in quadrature ``K m sqrt((2 + 3 sin^2 phi) / 2) / r^3``: not a function
     of the range alone, as in paper 004, Eq 14, but with a factor of 1.58 from pole to equator.
-    `phasor` (..., 3): (T), in any axes.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        (T)
+    `phasor` (..., 3): (T), in any axes. Returns (...) (T).
     """
     return np.asarray(np.sqrt(0.5 * np.sum(np.abs(phasor) ** 2, axis=-1)))

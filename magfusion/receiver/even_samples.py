@@ -31,14 +31,8 @@ class Spacing(NamedTuple):
 def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing | None]:
     """Return the spacing of each window at the finest valid step; None if it is not even.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n, m)
-        Of samples from the centre of each window (s).
-    count : int ndarray, shape (n,)
-        Samples in each window.
-    fastest_hz : float
-        Highest frequency of a tone.
+    `time` (n, m): of samples from the centre of each window (s). `count` (n,): samples in each
+    window. `fastest_hz`: highest frequency of a tone.
     """
     result: list[Spacing | None] = [None] * len(count)
     for shared in RATE_TOLERANCES:

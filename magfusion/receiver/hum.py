@@ -16,20 +16,11 @@ SMOOTHED = 5  # windows
 
 @dataclass(frozen=True, eq=False)
 class Hum:
-    """Phase of the mains over a record.
+    """Phase of the mains over a record."""
 
-    Parameters
-    ----------
-    frequency_hz : float
-        Mean frequency.
-    orders : ndarray, shape (harmonics,)
-        Harmonics below the Nyquist frequency.
-    time, turns : ndarray, shape (n,)
-        Turns up to each time (s).
-    """
-
-    frequency_hz: float
-    orders: Array
+    frequency_hz: float  # mean frequency
+    orders: Array  # (harmonics,), harmonics below the Nyquist frequency
+    # time, turns: (n,), turns up to each time (s)
     time: Array
     turns: Array
 

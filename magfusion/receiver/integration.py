@@ -26,23 +26,12 @@ PER_RESOLUTION = 4  # trial frequencies
 
 @dataclass(frozen=True, eq=False)
 class Integrated:
-    """One tone of a whole stationary interval.
+    """One tone of a whole stationary interval."""
 
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (3,)
-        (T)
-    cov : ndarray, shape (3, 3)
-        Of its real, and of its imaginary part (T^2).
-    freedom : int
-        Degrees of freedom of the covariance.
-    centroid, spread : float
-        Of the weights over time (s).
-    """
-
-    phasor: ComplexArray
-    cov: Array
-    freedom: int
+    phasor: ComplexArray  # (3,) (T)
+    cov: Array  # (3, 3), of its real, and of its imaginary part (T^2)
+    freedom: int  # degrees of freedom of the covariance
+    # centroid, spread: of the weights over time (s)
     centroid: float
     spread: float
 
@@ -85,7 +74,8 @@ def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     maximum = int(FARTHEST * span / result.length) - NEAREST
     others = NEAREST + np.arange(int(np.clip(maximum, MIN_NEIGHBOURS, MAX_NEIGHBOURS)))
     offsets_hz = np.concatenate([-others, others]) / span
-    detected = _taper_response(offsets_hz * result.length)
+    bins = offsets_hz * result.length
+    detected = np.sinc(bins) / (1.0 - bins**2)  # gain of a Hann taper
     carrier = np.exp(-2j * np.pi * offsets_hz[:, None] * elapsed)
     power = ((carrier * weight) @ (phasor - mean)) / detected[:, None]
     freedom = 2 * len(offsets_hz)
@@ -95,11 +85,6 @@ def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     centroid = float(weight @ elapsed)
     spread = float(np.sqrt(weight @ (elapsed - centroid) ** 2))
     return Integrated(mean, cov, freedom, centroid, spread)
-
-
-def _taper_response(bins: Array) -> Array:
-    """Return the gain of a Hann taper at an offset in bins."""
-    return np.asarray(np.sinc(bins) / (1.0 - bins**2))
 
 
 def _weights(phasor: ComplexArray) -> Array:

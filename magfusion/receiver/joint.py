@@ -21,7 +21,7 @@ from magfusion.receiver.design import nuisances_hz
 from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array
 
 SHORT_WINDOW = 0.2  # s
 NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: changes in between are a parabola
@@ -74,21 +74,13 @@ def _long(site: Site, requested: LockinSettings | None) -> LockinSettings | None
 
 
 class JointDesign(NamedTuple):
-    """Information of a window's samples on all tones together.
+    """Information of a window's samples on all tones together."""
 
-    Parameters
-    ----------
-    across : ndarray, shape (m, directions)
-        Orthonormal: the tones orthogonal to steady field, drift and mains.
-    tones : ndarray, shape (nodes, directions, 2 tones)
-        Cosines and sines of each tone in these directions, by node.
-    extra_design : ndarray, shape (m, probes)
-        Orthonormal, next to the tones: directions of noise.
-    """
-
+    # (m, directions), orthonormal: the tones orthogonal to steady field, drift and mains
     across: Array
+    # (nodes, directions, 2 tones), cosines and sines of each tone in these directions, by node
     tones: Array
-    extra_design: Array
+    extra_design: Array  # (m, probes), orthonormal, next to the tones: directions of noise
 
     @staticmethod
     def of(
@@ -223,6 +215,3 @@ class JointReceiver(LockinReceiver):
     def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
         """Return one: directions without samples only lose their information."""
         return np.ones(len(windows))
-
-    def _driven(self, windows: Windows) -> BoolArray:
-        return np.ones(len(windows), dtype=bool)

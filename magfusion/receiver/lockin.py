@@ -41,45 +41,28 @@ UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, in gaps of the gyro
 
 @dataclass(frozen=True, eq=False)
 class WindowOperator:
-    """Linear map from samples to phasors, kept to apply it to predictions as well.
+    """Linear map from samples to phasors, kept to apply it to predictions as well."""
 
-    Parameters
-    ----------
-    designs : Designs
-        From the sample times alone.
-    tone_of_channel : int ndarray, shape (channels,), optional
-        Tone of each channel, where several beacons share a frequency.
-    body_from_measured : ndarray, shape (3, 3)
-    still_from_body : ndarray, shape (4, samples)
-        Rotates each sample to non-rotating axes; quaternions, scalar first.
-    measured_from_still : ndarray, shape (windows, 3, 3)
-        Rotates the fields back at the centre of each window.
-    declared_noise : float
-        Of a sample, one sigma (T).
-    unseen : bool ndarray, shape (windows,)
-        Windows in a gap of the gyro: the ramps follow the unknown rotation, and its square is
-        noise.
-    is_separable : bool ndarray, shape (windows,)
-        Windows whose noise differs from that of their neighbours: their rotation was estimated
-        without a gyro.
-    lacking : tuple of int
-        Axes that the receiver lacks.  The samples of the others cannot be rotated, so that the
-        square of any rotation is noise, unless a prediction has been subtracted.
-    ac_coupled : bool
-        Whether the samples hold no steady field.
-    """
-
-    designs: Designs
+    designs: Designs  # from the sample times alone
     channels: tuple[tuple[str, int], ...]
-    body_from_measured: Array
+    body_from_measured: Array  # (3, 3)
+    # (4, samples), rotates each sample to non-rotating axes; quaternions, scalar first
     still_from_body: Array
+    # (windows, 3, 3), rotates the fields back at the centre of each window
     measured_from_still: Array
-    declared_noise: float
+    declared_noise: float  # of a sample, one sigma (T)
+    # (windows,), windows in a gap of the gyro: the ramps follow the unknown rotation, and its
+    # square is noise
     unseen: BoolArray
+    # (windows,), windows whose noise differs from that of their neighbours: their rotation was
+    # estimated without a gyro
     is_separable: BoolArray
+    # axes that the receiver lacks. The samples of the others cannot be rotated, so that the square
+    # of any rotation is noise, unless a prediction has been subtracted
     lacking: tuple[int, ...] = ()
+    # (channels,), tone of each channel, where several beacons share a frequency
     tone_of_channel: IntArray | None = None
-    ac_coupled: bool = False
+    ac_coupled: bool = False  # whether the samples hold no steady field
 
     @property
     def frequencies_hz(self) -> Array:
@@ -94,12 +77,9 @@ class WindowOperator:
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
         """Turn raw samples into phasors and the steady field, each with covariance.
 
-        Parameters
-        ----------
-        measured_sensor : ndarray, shape (samples, 3)
-            (T).  Where a prediction has been subtracted, the noise next to the tones excludes
-            the leakage of motion.  For the steady field, subtract the known offset or a
-            prediction first: the gyro rotates an offset along with the samples.
+        `measured_sensor` (samples, 3) (T). Where a prediction has been subtracted, the noise next
+        to the tones excludes the leakage of motion. For the steady field, subtract the known offset
+        or a prediction first: the gyro rotates an offset along with the samples.
         """
         samples, steady, _ = self.demodulate_both(measured_sensor)
         return samples, steady
@@ -109,12 +89,8 @@ class WindowOperator:
     ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
         """Return `demodulate` of a waveform, and the phasors of another at the same sample times.
 
-        `others` (samples, 3): the other waveform (T); without it the last result is empty.
-
-        Returns
-        -------
-        complex ndarray, shape (n, channels, 3)
-            Phasors of the other: measured axes at the centre of the window (T).
+        `others` (samples, 3): the other waveform (T); without it the last result is empty. Returns
+        (n, channels, 3), phasors of the other: measured axes at the centre of the window (T).
         """
         still, parts = self._still(measured_sensor), []
         other = None if others is None else self._still(others)

@@ -20,21 +20,12 @@ class Bursts:
     """Bursts with their running numbers and epochs.
 
     A repeated coil begins a new epoch, as does a burst more than `LONGEST_EPOCH` after the first.
-
-    Attributes
-    ----------
-    marks : Marks
-        Stored bursts, split to at most `LONGEST_BURST`.
-    first : int
-        Number of the first of these.
-    column : SlotColumn
-        Slots given per sample.
     """
 
     # What a checkpoint holds.
-    marks: Marks
-    first: int
-    column: SlotColumn
+    marks: Marks  # stored bursts, split to at most `LONGEST_BURST`
+    first: int  # number of the first of these
+    column: SlotColumn  # slots given per sample
     _epoch: IntArray
     _epoch_bursts: list[int]
     _epoch_start: float

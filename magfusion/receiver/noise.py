@@ -70,12 +70,8 @@ def noise_around_tones(seen: Array, dimensions: IntArray) -> Array:
     """Return the covariance per sample of the noise around each tone, in the axes of the samples.
 
     Unobserved directions get the mean noise of the observed ones. `seen` (n, tones, 4, 3):
-    residuals of probes (T). `dimensions` (n, tones): as of `probes_left`.
-
-    Returns
-    -------
-    ndarray, shape (n, tones, 3, 3)
-        (T^2)
+    residuals of probes (T). `dimensions` (n, tones): as of `probes_left`. Returns (n, tones, 3, 3)
+    (T^2).
     """
     share = np.maximum(dimensions, 1)[..., None, None] / seen.shape[-2]
     own = np.swapaxes(seen, -1, -2) @ seen / seen.shape[-2]

@@ -23,24 +23,14 @@ HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a fitted harmonic
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Phasors of pieces, each referred to its demodulation frequency.
+    """Phasors of pieces, each referred to its demodulation frequency."""
 
-    Parameters
-    ----------
-    centre : ndarray, shape (n,)
-        (s)
-    length : float
-        (s)
-    phasor : complex ndarray, shape (n, tones, components)
-        (T), the axes of the sensor; their phase is that of a cosine at time zero of the log.
-    extra_lines : complex ndarray, shape (n, probes, components)
-        Residual phasors at other frequencies.
-    """
-
-    centre: Array
-    length: float
+    centre: Array  # (n,) (s)
+    length: float  # (s)
+    # (n, tones, components) (T), the axes of the sensor; their phase is that of a cosine at time
+    # zero of the log
     phasor: ComplexArray
-    extra_lines: ComplexArray
+    extra_lines: ComplexArray  # (n, probes, components), residual phasors at other frequencies
 
     def rows(self, kept: BoolArray) -> "Pieces":
         """Return a subset of the pieces."""

@@ -20,25 +20,15 @@ STEPS = 8.0  # of the instrument, that a range must have before its end is reach
 
 @dataclass(eq=False)
 class RangeEnds:
-    """Observed range of one axis.
+    """Observed range of one axis."""
 
-    Parameters
-    ----------
-    low, high : float
-        Least and largest value so far (T).
-    finest : float
-        Smallest change from one sample to the next (T).
-    kept : int
-        Longest run of a constant value that was no extreme (samples); at most `LONGEST`.
-    until : float
-        Time of the last sample used (s).
-    """
-
+    # low, high: least and largest value so far (T)
     low: float = np.inf
     high: float = -np.inf
-    finest: float = np.inf
+    finest: float = np.inf  # smallest change from one sample to the next (T)
+    # longest run of a constant value that was no extreme (samples); at most `LONGEST`
     kept: int = 0
-    until: float = -np.inf
+    until: float = -np.inf  # time of the last sample used (s)
 
 
 def still(waveform: Waveform, first: IntArray, last: IntArray) -> BoolArray:
@@ -128,23 +118,14 @@ def _update_ends(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None
 
 
 class _Runs(NamedTuple):
-    """Observed range of one axis at each sample, shape (samples,) each.
+    """Observed range of one axis at each sample, shape (samples,) each."""
 
-    Parameters
-    ----------
-    value : ndarray
-        (T)
-    low, high, finest, kept : ndarray
-        As of `RangeEnds`, until then.
-    start : int ndarray
-        First sample of the current run.
-    """
-
-    value: Array
+    value: Array  # (T)
+    # low, high, finest, kept: as of `RangeEnds`, until then
     low: Array
     high: Array
     finest: Array
-    start: IntArray
+    start: IntArray  # first sample of the current run
     kept: Array
 
 

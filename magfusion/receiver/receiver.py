@@ -34,34 +34,16 @@ BEFORE = 256  # samples before a window, used to detect an axis that repeats one
 
 
 class Receiver(ABC):
-    """Windows of a waveform, each admitted or dropped once, and their phasors.
+    """Windows of a waveform, each admitted or dropped once, and their phasors."""
 
-    Attributes
-    ----------
-    grid : WindowGrid, optional
-        Positions of the windows, once it has begun.
-    next_number : int
-        Number of the next window to assess.
-    recent : int ndarray
-        Numbers of admitted windows that later phasors need.
-    dropped : Counter
-        Number of windows by reason.
-    needs_turn : bool
-        Whether windows without inertial samples are dropped.
-    joined : bool
-        Whether the pushed slots of a short cycle are one epoch.
-    without_turn : Windows
-        Windows assessed last that lack only inertial samples.
-    """
-
-    grid: WindowGrid | None
+    grid: WindowGrid | None  # positions of the windows, once it has begun
     admission: Admission | None
-    next_number: int
-    recent: IntArray
-    dropped: Counter[str]
-    needs_turn: bool
-    joined: bool
-    without_turn: Windows
+    next_number: int  # number of the next window to assess
+    recent: IntArray  # numbers of admitted windows that later phasors need
+    dropped: Counter[str]  # number of windows by reason
+    needs_turn: bool  # whether windows without inertial samples are dropped
+    joined: bool  # whether the pushed slots of a short cycle are one epoch
+    without_turn: Windows  # windows assessed last that lack only inertial samples
 
     def __init__(self, site: Site) -> None:
         self.needs_turn, self.joined = True, False

@@ -92,20 +92,10 @@ def common_noise(
 ) -> tuple[Array, IntArray, Array, int, IntArray] | None:
     """Correlate the noise of a sensor and a reference in stretches; None without a peak.
 
-    Lags are finer than a step: the peak of whitened noise is as narrow as a step.
-
-    Returns
-    -------
-    power : ndarray, shape (n, lags)
-        Of the correlation of each stretch.
-    starts : int ndarray, shape (n,)
-        First samples of the stretches.
-    mean : ndarray, shape (lags,)
-        Of the powers.
-    best : int
-        Where its peak is.
-    lags : int ndarray, shape (lags,)
-        In steps over `FINER`.
+    Lags are finer than a step: the peak of whitened noise is as narrow as a step. Returns
+    `power` (n, lags): of the correlation of each stretch; `starts` (n,): first samples of the
+    stretches; `mean` (lags,): of the powers; `best`: where its peak is; `lags` (lags,): in steps
+    over `FINER`.
     """
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2
@@ -198,20 +188,12 @@ class ReferenceNormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Relation:
-    """Relation of the noise of a sensor to that of a reference, about a tone.
+    """Relation of the noise of a sensor to that of a reference, about a tone."""
 
-    Parameters
-    ----------
-    matrix : complex ndarray, shape (3, 3)
-    remaining_share : float
-        Ratio of the noise power with and without it, in pieces not used for the estimate.
-    normal : ReferenceNormalEquations
-        Its normal equations, propagated to later pieces.
-    """
-
-    matrix: ComplexArray
+    matrix: ComplexArray  # (3, 3)
+    # ratio of the noise power with and without it, in pieces not used for the estimate
     remaining_share: float
-    normal: ReferenceNormalEquations
+    normal: ReferenceNormalEquations  # its normal equations, propagated to later pieces
 
     @property
     def is_effective(self) -> bool:

@@ -14,21 +14,14 @@ LAG_SIGMA, RATE_SIGMA = 1e-3, 1e-4  # s, and relative: of an estimated lag, of a
 
 @dataclass(frozen=True)
 class ReferenceClock:
-    """Estimated lags, and the line through them.
+    """Estimated lags, and the line through them."""
 
-    Parameters
-    ----------
-    weight : float
-        Sum over all lags.
-    time, lag : float
-        Weighted means (s).
-    square, product : float
-        Weighted sums of the squares of times, and of times by lags, about the means (s^2).
-    """
-
-    weight: float = 0.0
+    weight: float = 0.0  # sum over all lags
+    # time, lag: weighted means (s)
     time: float = 0.0
     lag: float = 0.0
+    # square, product: weighted sums of the squares of times, and of times by lags, about the means
+    # (s^2)
     square: float = 0.0
     product: float = 0.0
 

@@ -21,21 +21,11 @@ MAINS = 3  # number of harmonics
 
 @dataclass(frozen=True, eq=False)
 class RotorPhasors:
-    """Demodulated windows of a rotor.
+    """Demodulated windows of a rotor."""
 
-    Parameters
-    ----------
-    fields : FieldSamples
-        Phasors about the angle; their channels are the rotor's tones.
-    speed_hz : ndarray, shape (n,)
-        Mean of each window.
-    dropped : int
-        Windows that lack samples, or in which the magnet hardly rotates.
-    """
-
-    fields: FieldSamples
-    speed_hz: Array
-    dropped: int
+    fields: FieldSamples  # phasors about the angle; their channels are the rotor's tones
+    speed_hz: Array  # (n,), mean of each window
+    dropped: int  # windows that lack samples, or in which the magnet hardly rotates
 
 
 def demodulate_rotor(

@@ -35,14 +35,8 @@ Stamping = Literal["stamps", "counted", "rounded"]
 class RunningClock:
     """Replaces the stamps of a stream by an even clock, where they are not those of its samples.
 
-    `known`: kind of stamps, where it need not be found.
-
-    Attributes
-    ----------
-    stamping : str, optional
-        None until it is decided; ``counted`` if samples have the stamps of batches.
-    step : float
-        Between two samples (s).
+    `known`: kind of stamps, where it need not be found. Attributes: `stamping`: None until it is
+    decided; ``counted`` if samples have the stamps of batches. `step`: between two samples (s).
     """
 
     def __init__(self, known: Stamping | None = None) -> None:

@@ -38,26 +38,13 @@ MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cu
 
 
 class SamplingClock(NamedTuple):
-    """Uniform clock of a stream.
+    """Uniform clock of a stream."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Sampling times (s).
-    step : float
-        Between two ticks (s).
-    scatter : float
-        Root mean square of stamps about the clock (s).
-    lost_count : int
-        Ticks without a sample, except in gaps.
-    resolution : float
-        To which the stamps are rounded (s), where that explains their scatter; otherwise zero.
-    """
-
-    time: Array
-    step: float
-    scatter: float
-    lost_count: int
+    time: Array  # (n,), sampling times (s)
+    step: float  # between two ticks (s)
+    scatter: float  # root mean square of stamps about the clock (s)
+    lost_count: int  # ticks without a sample, except in gaps
+    # to which the stamps are rounded (s), where that explains their scatter; otherwise zero
     resolution: float = 0.0
 
 

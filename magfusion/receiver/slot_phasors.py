@@ -35,34 +35,18 @@ LONGEST_PAUSE = 1.0  # s; longer pauses separate the noise of marked bursts
 
 @dataclass(frozen=True, eq=False)
 class SlotValues:
-    """Values of slots, each in the measured axes of its own time.
+    """Values of slots, each in the measured axes of its own time."""
 
-    Parameters
-    ----------
-    number : int ndarray, shape (n,)
-        Running number from the start of the schedule, increasing.
-    centre, time : ndarray, shape (n,)
-        Middle of the slot, and mean time of its samples (s).
-    value : complex ndarray, shape (n, 3)
-        Phasor at the carrier, or field of direct current (T).
-    variance : ndarray, shape (n,)
-        Of a component, for samples of unit variance.
-    noise : ndarray, shape (n, 3, 3)
-        Covariance per sample of the noise near the carrier in this slot alone (T^2).
-    length : ndarray, shape (n,)
-        (s)
-    place : int ndarray, shape (n,)
-        Place in its cycle.
-    """
-
-    number: IntArray
+    number: IntArray  # (n,), running number from the start of the schedule, increasing
+    # centre, time: (n,), middle of the slot, and mean time of its samples (s)
     centre: Array
     time: Array
-    value: ComplexArray
-    variance: Array
+    value: ComplexArray  # (n, 3), phasor at the carrier, or field of direct current (T)
+    variance: Array  # (n,), of a component, for samples of unit variance
+    # (n, 3, 3), covariance per sample of the noise near the carrier in this slot alone (T^2)
     noise: Array
-    length: Array
-    place: IntArray
+    length: Array  # (n,) (s)
+    place: IntArray  # (n,), place in its cycle
 
     @staticmethod
     def none() -> "SlotValues":
@@ -152,16 +136,10 @@ def demodulate_slots(
     """Turn the slots of a tracker into one phasor for each driven slot.
 
     Pulses of direct current give a real phasor, the field itself. `measured_from_still`: as from
-    `magfusion.receiver.turn.turn_of`.
-
-    Returns
-    -------
-    samples : FieldSamples
-        A row for each driven slot with silent ones near it, at the mean time of its samples, with
-        one channel.  The covariance contains the noise of the slot and of the subtracted field,
-        and for marked pulses the residual hum estimated from their silent bursts.
-    number : int ndarray, shape (n,)
-        The slot of each row.
+    `magfusion.receiver.turn.turn_of`. Returns `samples`: a row for each driven slot with silent
+    ones near it, at the mean time of its samples, with one channel. The covariance contains the
+    noise of the slot and of the subtracted field, and for marked pulses the residual hum estimated
+    from their silent bursts; `number` (n,): the slot of each row.
     """
     turn, still_from_measured = measured_from_still.both(values.time)
     still = _applied(still_from_measured, values.value)
@@ -221,33 +199,15 @@ def _hum(
 
 @dataclass(frozen=True, eq=False)
 class _Inside:
-    """Samples of some slots, concatenated.
+    """Samples of some slots, concatenated."""
 
-    Parameters
-    ----------
-    owner : int ndarray, shape (samples,)
-        The slot of each.
-    begins : int ndarray, shape (slots,)
-        Where each slot begins among them.
-    time : ndarray, shape (samples,)
-        (s)
-    elapsed : ndarray, shape (samples,)
-        Since the slot began (s).
-    still : ndarray, shape (samples, 3)
-        (T), non-rotating axes.
-    hann : ndarray, shape (samples,)
-        Taper over the slot.
-    slot_begin : ndarray, shape (slots,)
-        (s)
-    """
-
-    owner: IntArray
-    begins: IntArray
-    time: Array
-    elapsed: Array
-    still: Array
-    hann: Array
-    slot_begin: Array
+    owner: IntArray  # (samples,), the slot of each
+    begins: IntArray  # (slots,), where each slot begins among them
+    time: Array  # (samples,) (s)
+    elapsed: Array  # (samples,), since the slot began (s)
+    still: Array  # (samples, 3) (T), non-rotating axes
+    hann: Array  # (samples,), taper over the slot
+    slot_begin: Array  # (slots,) (s)
 
 
 def _inside(time: Array, still: Array, windows: Windows, rate_hz: float) -> _Inside:

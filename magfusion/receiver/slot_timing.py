@@ -93,8 +93,8 @@ def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: flo
     """Return the mean carrier amplitude in each bin of the cycle, from the first sample on."""
     size = np.zeros(len(time))
     for carrier_hz in np.unique(carriers_hz(site, slots.count)):
-        propagated = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
-        propagated = propagated * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
+        varying = measured - _mean_about(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
+        propagated = varying * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
         length = max(2, round(rate_hz * max(2.0 / carrier_hz, slots.duration / 16.0)))
         size += np.linalg.norm(_mean_about(propagated, length), axis=1)
     bins = np.floor((time - time[0]) / slots.cycle % 1.0 * slots.count * BINS).astype(np.int64)
@@ -108,11 +108,6 @@ def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: flo
         return np.asarray(mean)
     # If whole cycles are whole samples, a cycle has no more bins than samples.
     return np.interp(np.arange(len(count)), dimensions, mean, period=len(count))
-
-
-def _alone(measured: Array, length: int) -> Array:
-    """Return samples less their moving mean over ``length`` samples."""
-    return np.asarray(measured - _mean_about(measured, length))
 
 
 def _mean_about(values: AnyArray, length: int) -> AnyArray:

@@ -19,24 +19,14 @@ NOISE_CYCLES = 16  # over which the noise is averaged
 
 @dataclass(frozen=True)
 class SlotSettings:
-    """Settings for the demodulation of time slots.
+    """Settings for the demodulation of time slots."""
 
-    Parameters
-    ----------
-    removal : {"none", "subtract", "interpolate", "state"}
-        How the silent slots remove the ambient field from the others, see
-        `magfusion.receiver.ambient.ambient_weights`.
-    taper : {"rectangular", "hann"}
-        Weight of the samples within a slot.
-    cycles : int
-        Length of the ambient state.
-    mains_hz : float
-        Mains frequency in the ambient state of pulsed direct current; 0 for none.
-    """
-
+    # how the silent slots remove the ambient field from the others, see
+    # `magfusion.receiver.ambient.ambient_weights`
     removal: Removal
-    taper: Literal["rectangular", "hann"]
-    cycles: int = 8
+    taper: Literal["rectangular", "hann"]  # weight of the samples within a slot
+    cycles: int = 8  # length of the ambient state
+    # mains frequency in the ambient state of pulsed direct current; 0 for none
     mains_hz: float = 50.0
 
 

@@ -17,18 +17,11 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """Rotation of the axes of a magnetometer against non-rotating axes.
+    """Rotation of the axes of a magnetometer against non-rotating axes."""
 
-    Parameters
-    ----------
-    still_from_body : callable
-        At times (m,), unit quaternions of shape (4, m), scalar first.
-    from_body : ndarray, shape (3, 3)
-        From `measured_from_body`; not necessarily a rotation.
-    """
-
+    # at times (m,), unit quaternions of shape (4, m), scalar first
     still_from_body: Callable[[Array], Array]
-    from_body: Array
+    from_body: Array  # (3, 3), from `measured_from_body`; not necessarily a rotation
 
     def __call__(self, time: Array) -> Array:
         """Return ``measured_from_still`` at times (m,), shape (m, 3, 3)."""

@@ -17,28 +17,17 @@ AGAIN_WINDOW = 1.0  # s; in which beacons sharing a frequency must not be receiv
 
 @dataclass(frozen=True)
 class LockinSettings:
-    """Settings of a lock-in.
+    """Settings of a lock-in."""
 
-    Parameters
-    ----------
-    window, step : float
-        Length of a window and distance between two (s).
-    mains_hz : float
-        Mains frequency; 0 for none.  Harmonics below the Nyquist frequency are fitted too.
-    noise_windows : int
-        Windows over which the noise near the tones is averaged.
-    lines_hz : tuple of float
-        Additional lines that are fitted as tones are.
-    origin : float, optional
-        Centre of one window (s), which need not be in the log; None begins with the first sample.
-        It aligns the windows of several streams.
-    """
-
+    # window, step: length of a window and distance between two (s)
     window: float
     step: float
+    # mains frequency; 0 for none. Harmonics below the Nyquist frequency are fitted too
     mains_hz: float = 50.0
-    noise_windows: int = 9
-    lines_hz: tuple[float, ...] = ()
+    noise_windows: int = 9  # windows over which the noise near the tones is averaged
+    lines_hz: tuple[float, ...] = ()  # additional lines that are fitted as tones are
+    # centre of one window (s), which need not be in the log; None begins with the first sample. It
+    # aligns the windows of several streams
     origin: float | None = None
 
     def first_centre(self, begin: float) -> float:

@@ -11,22 +11,13 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class AssociatedPoses:
-    """Estimate and truth at the same n times.
-
-    Parameters
-    ----------
-    compared : ndarray of bool
-        Which epochs of the estimate were compared, or which samples of the truth.
-    not_covered : str
-        Why others were not; empty where all were.
-    at_truth : bool
-        Whether the times are those of the truth, which is coarser than the estimate.
-    """
+    """Estimate and truth at the same n times."""
 
     estimate: Trajectory
     truth: Trajectory
-    compared: BoolArray
-    not_covered: str = ""
+    compared: BoolArray  # which epochs of the estimate were compared, or which samples of the truth
+    not_covered: str = ""  # why others were not; empty where all were
+    # whether the times are those of the truth, which is coarser than the estimate
     at_truth: bool = False
 
     def first(self, count: int | None) -> "AssociatedPoses":

@@ -35,34 +35,21 @@ COMPARED = 400  # points at which candidates for one more beacon are compared
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Bound of the pose from one window, at each point of a volume.
+    """Bound of the pose from one window, at each point of a volume."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        Origin of the body (m).
-    position_sigma : ndarray, shape (n,)
-        Root of the sum of the three axes' variances (m); infinite where not determined.
-    attitude_sigma : ndarray, shape (n,)
-        The same of the rotation vector (rad); zero where the attitude is known independently.
-    worst_world : ndarray, shape (n, 3)
-        Unit vector along which the position is least certain; zero where not determined.
-    beacons : int ndarray, shape (n,)
-        Number of beacons detected above the noise.
-    determined : bool ndarray, shape (n,)
-        False where a direction of the pose is undetermined, or a beacon is too close to be a
-        dipole.
-    protection_level_m, protection_level_deg : ndarray, shape (n,), optional
-        Bounds of the errors of position and attitude with an undetected fault of one beacon;
-        infinite where there is none.  None without a risk.
-    """
-
-    position_world: Array
+    position_world: Array  # (n, 3), origin of the body (m)
+    # (n,), root of the sum of the three axes' variances (m); infinite where not determined
     position_sigma: Array
+    # (n,), the same of the rotation vector (rad); zero where the attitude is known independently
     attitude_sigma: Array
+    # (n, 3), unit vector along which the position is least certain; zero where not determined
     worst_world: Array
-    beacons: IntArray
+    beacons: IntArray  # (n,), number of beacons detected above the noise
+    # (n,), False where a direction of the pose is undetermined, or a beacon is too close to be a
+    # dipole
     determined: BoolArray
+    # protection_level_m, protection_level_deg: (n,), bounds of the errors of position and attitude
+    # with an undetected fault of one beacon; infinite where there is none. None without a risk
     protection_level_m: Array | None = None
     protection_level_deg: Array | None = None
 
@@ -94,14 +81,8 @@ class ExtraBeacon:
 def volume(box_world: Array, spacing: float, heights: Array | None = None) -> Array:
     """Return the points of a regular grid that spans a box, shape (n, 3) (m).
 
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m).
-    spacing : float
-        Largest distance of neighbours along an axis (m).
-    heights : ndarray, optional
-        Heights instead of the box's own (m).
+    `box_world` (2, 3): lower and upper corner (m). `spacing`: largest distance of neighbours along
+    an axis (m). `heights`: heights instead of the box's own (m).
     """
     steps = np.ceil((box_world[1] - box_world[0]) / spacing * (1.0 - 1e-9)).astype(int)
     x, y, z = (np.linspace(box_world[0, i], box_world[1, i], steps[i] + 1) for i in range(3))
@@ -224,14 +205,9 @@ def best_extra_beacon(
 ) -> ExtraBeacon:
     """Find the best position of one more beacon of the first's kind, on the boundary of a box.
 
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3)
-        Its corners, and the centres of its edges and faces, are the candidates (m).
-    bound : callable
-        `coverage` of a site at given points.
-    position_world : ndarray, shape (n, 3)
-        Positions of the platform to navigate at (m); the median of their sigmas is minimised.
+    `box_world` (2, 3): its corners, and the centres of its edges and faces, are the candidates (m).
+    `bound`: `coverage` of a site at given points. `position_world` (n, 3): positions of the
+    platform to navigate at (m); the median of their sigmas is minimised.
     """
     step = -(-len(position_world) // COMPARED)
     points = position_world[step // 2 :: step]

@@ -28,26 +28,17 @@ Verdict = Literal["pass", "fail", "undecided"]
 
 @dataclass(frozen=True, eq=False)
 class ErrorSeries:
-    """Errors of the states of one run.
+    """Errors of the states of one run."""
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    measured : ndarray of bool, shape (n,)
-        Whether a field was measured there; the states between are propagated by the IMU.
-    error, sigma : ndarray, shape (n, 15)
-        Attitude (rad), position (m) and velocity (m/s) in world axes, so that a steady drift
-        accumulates whatever the body's attitude; biases of the accelerometer (m/s^2) and the gyro
-        (rad/s) in body axes.
-    pose_nees, bias_nees : ndarray, shape (n,)
-        Normalised errors squared, of six degrees of freedom each.
-    """
-
-    time: Array
+    time: Array  # (n,) (s)
+    # (n,), whether a field was measured there; the states between are propagated by the IMU
     measured: BoolArray
+    # error, sigma: (n, 15), attitude (rad), position (m) and velocity (m/s) in world axes, so that
+    # a steady drift accumulates whatever the body's attitude; biases of the accelerometer (m/s^2)
+    # and the gyro (rad/s) in body axes
     error: Array
     sigma: Array
+    # pose_nees, bias_nees: (n,), normalised errors squared, of six degrees of freedom each
     pose_nees: Array
     bias_nees: Array
 
@@ -112,20 +103,12 @@ class CommonSlope:
 
     The length of an error does not show it: a drift of a millimetre adds nothing to a constant
     error of a centimetre perpendicular to it.
-
-    Parameters
-    ----------
-    per_day : ndarray, shape (3,)
-        Mean over the worlds.
-    standard_error : ndarray, shape (3,)
-        From their scatter.
-    probability : float
-        Of slopes as far from zero by chance, by Hotelling's test of all three components at once;
-        below `THREE_SIGMA` they are beyond three standard errors.
     """
 
-    per_day: Array
-    standard_error: Array
+    per_day: Array  # (3,), mean over the worlds
+    standard_error: Array  # (3,), from their scatter
+    # of slopes as far from zero by chance, by Hotelling's test of all three components at once;
+    # below `THREE_SIGMA` they are beyond three standard errors
     probability: float
 
     @property
@@ -188,25 +171,15 @@ def in_windows(time: Array, value: Array, edges: Array) -> Array:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A tested part of the error.
+    """A tested part of the error."""
 
-    Parameters
-    ----------
-    name, unit : str
-        As in the report.
-    part : slice
-        Of an error's columns.
-    scale : float
-        From SI to the unit.
-    limit : float
-        Maximum slope, by design (unit per day): it would take days to reach about the error of a
-        good installation.
-    """
-
+    # name, unit: as in the report
     name: str
     unit: str
-    part: slice
-    scale: float
+    part: slice  # of an error's columns
+    scale: float  # from SI to the unit
+    # maximum slope, by design (unit per day): it would take days to reach about the error of a good
+    # installation
     limit: float
 
     @property
@@ -231,23 +204,14 @@ def settled_after(hours: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorPlot:
-    """Plotted data of an estimator.
-
-    Parameters
-    ----------
-    worlds : tuple of ErrorSeries
-        Errors in each world, at equal intervals.
-    interval : float
-        This interval (s).
-    pace : ndarray, shape (pieces, 6)
-        Of the first world: begin (s), processor time (s), updates, memory (MiB), squared
-        innovation in units of its expectation, processor time of one sample of a bare loop at that
-        time (s).
-    """
+    """Plotted data of an estimator."""
 
     name: str
-    worlds: tuple[ErrorSeries, ...]
-    interval: float
+    worlds: tuple[ErrorSeries, ...]  # errors in each world, at equal intervals
+    interval: float  # this interval (s)
+    # (pieces, 6), of the first world: begin (s), processor time (s), updates, memory (MiB), squared
+    # innovation in units of its expectation, processor time of one sample of a bare loop at that
+    # time (s)
     pace: Array
 
     @property
@@ -258,12 +222,8 @@ class EstimatorPlot:
     def hourly(self) -> tuple[Array, dict[str, Array]]:
         """Return the middles of the hours (h) and the means of squares over all worlds.
 
-        Returns
-        -------
-        time : ndarray, shape (hours,)
-        levels : dict of str to ndarray, shape (hours,)
-            Squared errors of pose and bias, and squared innovations of the first world, all
-            relative to their expectation.
+        Returns `time` (hours,); `levels` (hours,): squared errors of pose and bias, and squared
+        innovations of the first world, all relative to their expectation.
         """
         edges = HOUR * np.arange(np.ceil(self.errors.time[-1] / HOUR) + 1)
         time = np.concatenate([w.time for w in self.worlds])

@@ -24,27 +24,13 @@ ELONGATED = 3.0  # worst over median sigma, from which the geometry limits
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Variance of the position by source, at some points.
+    """Variance of the position by source, at some points."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    sigma : ndarray, shape (n,)
-        Position sigma with all sources (m).
-    sources : tuple of str
-        With any contribution.
-    variance : ndarray, shape (n, sources)
-        Contribution of each (m^2); they add up to ``sigma**2``.
-    without : ndarray, shape (n, sources)
-        Position sigma if a source vanished (m).
-    """
-
-    position_world: Array
-    sigma: Array
-    sources: tuple[str, ...]
-    variance: Array
-    without: Array
+    position_world: Array  # (n, 3) (m)
+    sigma: Array  # (n,), position sigma with all sources (m)
+    sources: tuple[str, ...]  # with any contribution
+    variance: Array  # (n, sources), contribution of each (m^2); they add up to ``sigma**2``
+    without: Array  # (n, sources), position sigma if a source vanished (m)
 
     @property
     def share(self) -> Array:

@@ -16,21 +16,11 @@ from magfusion.units import Array, BoolArray, IntArray
 
 
 class RelativeErrors(NamedTuple):
-    """Relative pose errors (RPE) over pairs of epochs.
+    """Relative pose errors (RPE) over pairs of epochs."""
 
-    Parameters
-    ----------
-    pairs : ndarray of int, shape (m, 2)
-        First and second epoch of each pair.
-    translation : ndarray, shape (m,)
-        (m)
-    rotation : ndarray, shape (m,)
-        Geodesic angle (rad).
-    """
-
-    pairs: IntArray
-    translation: Array
-    rotation: Array
+    pairs: IntArray  # (m, 2), first and second epoch of each pair
+    translation: Array  # (m,) (m)
+    rotation: Array  # (m,), geodesic angle (rad)
 
     def __repr__(self) -> str:
         return one_line("RelativeErrors", [f"{len(self.pairs)} pairs"])
@@ -51,53 +41,31 @@ class TrajectoryErrors:
     """Estimate minus truth at each of the estimate's times for which there is a truth.
 
     Errors of a part that the truth lacks are NaN: of attitude, or of position.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch.
-    compared : ndarray of bool, shape (epochs of the estimate,)
-        Which epochs of the estimate were compared; of a truth that is too coarse to be
-        interpolated, which of its samples.
-    position_world : ndarray, shape (n, 3)
-        (m)
-    pose_body : ndarray, shape (n, 6)
-        ``Pose3.localCoordinates(truth, estimate)``: rotation, translation in body axes (rad, m).
-    attitude : ndarray, shape (n,)
-        Geodesic angle (rad).
-    aligned_position_world : ndarray, shape (n, 3)
-        After the rigid motion of the estimate that fits the positions best (Umeyama, no scale; m).
-    aligned_attitude : ndarray, shape (n,)
-        After the one constant world rotation that fits the attitudes best (rad).
-    relative : RelativeErrors
-        Over consecutive pairs of compared epochs.
-    world_from_body : ndarray, shape (n, 3, 3)
-        Of the estimate.
-    pose_cov : ndarray, shape (n, 6, 6), optional
-        Of the estimate, where it has one.
-    nees : ndarray, shape (n,), optional
-        Normalised estimation error squared where there is a covariance, of `degrees_of_freedom`.
-    not_covered : str
-        Why other epochs were not compared; empty where all were.
-    at_truth : bool
-        Whether the samples of the truth were compared.
     """
 
     __repr__ = short_repr
 
-    time: Array
+    time: Array  # (n,), seconds since the log's epoch
+    # (epochs of the estimate,), which epochs of the estimate were compared; of a truth that is too
+    # coarse to be interpolated, which of its samples
     compared: BoolArray
-    position_world: Array
+    position_world: Array  # (n, 3) (m)
+    # (n, 6), ``Pose3.localCoordinates(truth, estimate)``: rotation, translation in body axes (rad,
+    # m)
     pose_body: Array
-    attitude: Array
+    attitude: Array  # (n,), geodesic angle (rad)
+    # (n, 3), after the rigid motion of the estimate that fits the positions best (Umeyama, no
+    # scale; m)
     aligned_position_world: Array
+    # (n,), after the one constant world rotation that fits the attitudes best (rad)
     aligned_attitude: Array
-    relative: RelativeErrors
-    world_from_body: Array
-    pose_cov: Array | None = None
+    relative: RelativeErrors  # over consecutive pairs of compared epochs
+    world_from_body: Array  # (n, 3, 3), of the estimate
+    pose_cov: Array | None = None  # (n, 6, 6), of the estimate, where it has one
+    # (n,), normalised estimation error squared where there is a covariance, of `degrees_of_freedom`
     nees: Array | None = None
-    not_covered: str = ""
-    at_truth: bool = False
+    not_covered: str = ""  # why other epochs were not compared; empty where all were
+    at_truth: bool = False  # whether the samples of the truth were compared
 
     @property
     def has_position(self) -> bool:

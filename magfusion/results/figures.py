@@ -50,38 +50,19 @@ class ErrorColumn(StrEnum):
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of a job.
+    """One figure of a job."""
 
-    Parameters
-    ----------
-    name : str
-        Key of ``report.json``, with ``{beacon}`` for the beacon's name.
-    unit : str
-        As shown on the screen; the key has a suffix of its own.
-    beacon : str, optional
-        Name of the beacon; the screen lists the same figure of several beacons in one line.
-    label : str
-        Title on the screen; default: the name without its unit.
-    column : ErrorColumn
-        Of the section's table.
-    note : str
-        A warning that the screen shows with the figure.
-    remark : str
-        A sentence that the screen shows after all notes.
-    refused : bool
-        Whether it counts rejected data; its title has the reason.
-    """
-
-    name: str
+    name: str  # key of ``report.json``, with ``{beacon}`` for the beacon's name
     value: Value
-    unit: str = ""
+    unit: str = ""  # as shown on the screen; the key has a suffix of its own
+    # name of the beacon; the screen lists the same figure of several beacons in one line
     beacon: str | None = None
     section: Section = Section.SUMMARY
-    label: str = ""
-    column: ErrorColumn = ErrorColumn.NONE
-    note: str = ""
-    remark: str = ""
-    refused: bool = False
+    label: str = ""  # title on the screen; default: the name without its unit
+    column: ErrorColumn = ErrorColumn.NONE  # of the section's table
+    note: str = ""  # a warning that the screen shows with the figure
+    remark: str = ""  # a sentence that the screen shows after all notes
+    refused: bool = False  # whether it counts rejected data; its title has the reason
 
     @property
     def key(self) -> str:
@@ -108,22 +89,15 @@ class Figure:
 class ParameterEstimate(Figure):
     """One calibration parameter after the fit; the value is its change from the declared one.
 
-    Parameters
-    ----------
-    label : str
-        Of its vector, which is one line on the screen.
-    sigma, prior_sigma : float
-        Posterior and prior standard deviation; a prior of zero is none.
-    is_open : bool
-        Whether the measurements do not determine it, whatever its sigma.
-    declared : float, optional
-        Its value before, if any: of a rotation only the change is a number.
+    `label`: of its vector, which is one line on the screen.
     """
 
     section: Section = Section.CALIBRATION
+    # sigma, prior_sigma: posterior and prior standard deviation; a prior of zero is none
     sigma: float = 0.0
     prior_sigma: float = 0.0
-    is_open: bool = False
+    is_open: bool = False  # whether the measurements do not determine it, whatever its sigma
+    # its value before, if any: of a rotation only the change is a number
     declared: float | None = None
 
     @property
@@ -146,10 +120,7 @@ class ParameterEstimate(Figure):
 class Figures(Mapping[str, Value]):
     """The figures of a job in their order; as a mapping, the content of ``report.json``.
 
-    Raises
-    ------
-    ValueError
-        Where two figures without a beacon have the same key.
+    Raises ValueError where two figures without a beacon have the same key.
     """
 
     def __init__(self, *figures: Figure) -> None:

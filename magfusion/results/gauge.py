@@ -35,25 +35,13 @@ Parts = dict[tuple[Parameter, str], Array]
 
 
 class Gauge(NamedTuple):
-    """A change of the calibration that changes no measurement, or hardly any.
+    """A change of the calibration that changes no measurement, or hardly any."""
 
-    Parameters
-    ----------
-    name : str
-        E.g. ``all beacons shifted together along x``.
-    unit : ParameterUnit
-        Of the amplitude.
-    direction : ndarray, shape (dimension,)
-        Tangent vector of amplitude one.
-    exact : bool
-        False where gravity or acceleration may observe it.
-    """
-
-    name: str
+    name: str  # e.g. ``all beacons shifted together along x``
     remedy: str
-    unit: ParameterUnit
-    direction: Array
-    exact: bool = True
+    unit: ParameterUnit  # of the amplitude
+    direction: Array  # (dimension,), tangent vector of amplitude one
+    exact: bool = True  # False where gravity or acceleration may observe it
 
 
 def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
@@ -72,10 +60,8 @@ def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
 def frame_directions(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> Array | None:
     """Return the motions of the world frame: all beacons shifted along x, y, z, and turned in yaw.
 
-    Returns
-    -------
-    ndarray, shape (dimension, 4), optional
-        Per metre and radian; None where a beacon is fixed, and the frame with it.
+    Returns (dimension, 4), per metre and radian; None where a beacon is fixed, and the frame with
+    it.
     """
     moves = [
         gauge.direction for gauge in (*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,)))

@@ -30,27 +30,15 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, eq=False)
 class MotionCoverage:
-    """Range of the platform's positions and attitudes.
+    """Range of the platform's positions and attitudes."""
 
-    Parameters
-    ----------
-    nearest : mapping
-        Beacon to the sensor's minimum distance from it (m).
-    spread_deg : mapping
-        Beacon to the largest angle, seen from it, between the sensor and its mean direction.
-    extent_world : ndarray, shape (3,)
-        Range of the position (m).
-    turned_deg : ndarray, shape (3,)
-        Root mean square of the rotation from the mean attitude, about each axis of the body.
-    rest_share : float
-        Share of stationary samples.
-    """
-
-    nearest: Mapping[str, float]
+    nearest: Mapping[str, float]  # beacon to the sensor's minimum distance from it (m)
+    # beacon to the largest angle, seen from it, between the sensor and its mean direction
     spread_deg: Mapping[str, float]
-    extent_world: Array
+    extent_world: Array  # (3,), range of the position (m)
+    # (3,), root mean square of the rotation from the mean attitude, about each axis of the body
     turned_deg: Array
-    rest_share: float
+    rest_share: float  # share of stationary samples
 
 
 def motion_coverage(

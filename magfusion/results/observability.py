@@ -36,27 +36,15 @@ class Weakness(NamedTuple):
 
 
 class CalibrationObservability(NamedTuple):
-    """Observability of the calibration.
+    """Observability of the calibration."""
 
-    Parameters
-    ----------
-    ratio : ndarray, shape (dimension,)
-        Posterior over prior sigma of each parameter.
-    ratio_but_for_gauge : ndarray, shape (dimension,)
-        The same, without the open gauge in either; NaN where nothing of the parameter remains.
-    direction_ratio : ndarray, shape (dimension,)
-        Posterior over prior sigma of each direction, ascending.
-    gauge : tuple of Weakness
-        Gauge directions, which are open for any log.
-    weakest : tuple of Weakness
-        The weakest of the other directions that are open.
-    """
-
-    ratio: Array
+    ratio: Array  # (dimension,), posterior over prior sigma of each parameter
+    # (dimension,), the same, without the open gauge in either; NaN where nothing of the parameter
+    # remains
     ratio_but_for_gauge: Array
-    direction_ratio: Array
-    gauge: tuple[Weakness, ...]
-    weakest: tuple[Weakness, ...]
+    direction_ratio: Array  # (dimension,), posterior over prior sigma of each direction, ascending
+    gauge: tuple[Weakness, ...]  # gauge directions, which are open for any log
+    weakest: tuple[Weakness, ...]  # the weakest of the other directions that are open
 
     @property
     def determined(self) -> int:
@@ -69,14 +57,8 @@ def observability(
 ) -> CalibrationObservability:
     """Compare the posterior of a calibration with its prior.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        At the posterior.
-    blocks : tuple of Block
-        With the prior's sigmas.
-    cov : ndarray, shape (dimension, dimension)
-        Posterior.
+    `calibration`: at the posterior. `blocks`: with the prior's sigmas.
+    `cov` (dimension, dimension): posterior.
     """
     prior = prior_sigma(blocks)
     scaled = cov / prior[:, None] / prior
@@ -100,10 +82,7 @@ def observability(
 def gauge_basis(calibration: Calibration, blocks: tuple[Block, ...]) -> Array:
     """Return the gauge directions that no log determines, orthonormal in units of the prior.
 
-    Returns
-    -------
-    ndarray, shape (dimension, gauges)
-        Without those that gravity or acceleration may determine.
+    Returns (dimension, gauges), without those that gravity or acceleration may determine.
     """
     prior = prior_sigma(blocks)
     columns = [q for gauge, q, _ in _orthonormal(calibration, blocks, prior) if gauge.exact]

@@ -12,28 +12,15 @@ from magfusion.units import NS_PER_S, Array
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """Pose in a world with z up, velocity in body axes.
+    """Pose in a world with z up, velocity in body axes."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Since the epoch of the drive phases, or 1970 where that is known to be so.
-    position_world, velocity_body : ndarray, shape (3,)
-        (m, m/s)
-    quaternion : ndarray, shape (4,)
-        Of ``world_from_body``, w first.
-    pose_cov : ndarray, shape (6, 6)
-        Position, then rotation, about the axes of the world (m^2, rad^2).
-    velocity_cov_body : ndarray, shape (3, 3)
-        (m^2/s^2)
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # since the epoch of the drive phases, or 1970 where that is known to be so
+    # position_world, velocity_body: (3,) (m, m/s)
     position_world: Array
-    quaternion: Array
+    quaternion: Array  # (4,), of ``world_from_body``, w first
     velocity_body: Array
-    pose_cov: Array
-    velocity_cov_body: Array
+    pose_cov: Array  # (6, 6), position, then rotation, about the axes of the world (m^2, rad^2)
+    velocity_cov_body: Array  # (3, 3) (m^2/s^2)
 
 
 def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:

@@ -36,24 +36,13 @@ DETECTION_CHI_SQUARE = (
 
 @dataclass(frozen=True, eq=False)
 class PoseRows:
-    """Whitened Jacobians of the fields at each of some poses.
+    """Whitened Jacobians of the fields at each of some poses."""
 
-    Parameters
-    ----------
-    by_pose : ndarray, shape (n, rows, 6)
-        Rotation, then position, body axes; the position alone for a known attitude.
-    by_nuisance : ndarray, shape (n, rows, nuisances)
-        By the uncertain survey parameters.
-    owner : int ndarray, shape (rows,)
-        Beacon of each row.
-    detected : int ndarray, shape (n,)
-        Number of beacons detected above the noise.
-    """
-
+    # (n, rows, 6), rotation, then position, body axes; the position alone for a known attitude
     by_pose: Array
-    by_nuisance: Array
-    owner: IntArray
-    detected: IntArray
+    by_nuisance: Array  # (n, rows, nuisances), by the uncertain survey parameters
+    owner: IntArray  # (rows,), beacon of each row
+    detected: IntArray  # (n,), number of beacons detected above the noise
 
     def without(self, beacon: int) -> "PoseRows":
         """Return the rows without one beacon: its own are empty."""
@@ -88,14 +77,8 @@ def whitened(
 ) -> PoseRows:
     """Return the whitened Jacobians of all channels at places.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (channels,)
-        Of a phasor's components, due to noise alone (T^2).
-    attitude : ndarray, shape (3, 3)
-        world_from_body, the same everywhere.
-    position_world : ndarray, shape (n, 3)
-        (m)
+    `variance` (channels,): of a phasor's components, due to noise alone (T^2). `attitude` (3, 3):
+    world_from_body, the same everywhere. `position_world` (n, 3) (m).
     """
     site, count = calibration.site, len(position_world)
     rotation = np.broadcast_to(attitude, (count, 3, 3))
@@ -142,18 +125,9 @@ def prior_of(site: Site, blocks: tuple[Block, ...]) -> tuple[Array, Array]:
 def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 0) -> Array:
     """Return a triangular root of the pose's information with the nuisances marginalised.
 
-    Parameters
-    ----------
-    spread : ndarray, shape (nuisances, nuisances)
-        Scale from the nuisances of the prior.
-    prior : ndarray, shape (k, nuisances)
-        Rows of the prior.
-    shared : int
-        Number of the last nuisances that remain, in front of the pose.
-
-    Returns
-    -------
-    ndarray, shape (n, k, shared + 6)
+    `spread` (nuisances, nuisances): scale from the nuisances of the prior. `prior` (k, nuisances):
+    rows of the prior. `shared`: number of the last nuisances that remain, in front of the pose.
+    Returns (n, k, shared + 6).
     """
     reported = np.any(seen.by_nuisance, axis=(0, 1)) | np.any(prior, axis=0)
     reported[len(reported) - shared :] = True

@@ -21,27 +21,13 @@ _LIBRARIES = ("numpy", "scipy", "gtsam")
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a command.
+    """One run of a command."""
 
-    Parameters
-    ----------
-    command : str
-        As typed.
-    options : mapping
-        Value of every option.
-    given : set of str
-        Those typed rather than left at their defaults.
-    inputs : tuple of Path
-        Input files and directories.
-    overwrite : bool
-        Whether an earlier result is removed rather than moved.
-    """
-
-    command: str
-    options: Mapping[str, object] = field(default_factory=dict)
-    given: frozenset[str] = frozenset()
-    inputs: tuple[Path, ...] = ()
-    overwrite: bool = False
+    command: str  # as typed
+    options: Mapping[str, object] = field(default_factory=dict)  # value of every option
+    given: frozenset[str] = frozenset()  # those typed rather than left at their defaults
+    inputs: tuple[Path, ...] = ()  # input files and directories
+    overwrite: bool = False  # whether an earlier result is removed rather than moved
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
     began: float = field(default_factory=time.perf_counter)
 

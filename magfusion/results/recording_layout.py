@@ -23,12 +23,7 @@ def readable_range(*shown: Array, zero: bool = False) -> tuple[float, float] | N
 
     It labels powers of ten and their multiples, and of these only sufficiently spaced ones: in a
     low plot over +-4, only zero. `shown`: the drawn values, which may be NaN. `zero`: whether zero
-    is in the range.
-
-    Returns
-    -------
-    tuple of float, optional
-        None for no value or a single one.
+    is in the range. Returns None for no value or a single one.
     """
     values = np.concatenate([np.ravel(one) for one in shown]) if shown else np.empty(0)
     values = values[np.isfinite(values)]
@@ -68,14 +63,8 @@ def plot(
 ) -> rrb.TimeSeriesView:
     """Return a plot of the series below an entity.
 
-    Parameters
-    ----------
-    name : str
-        Title: the quantity with its unit.
-    span : TimeRange, optional
-        Of the horizontal axis.
-    values : tuple of float, optional
-        Of the vertical axis, from `readable_range`; by default set by the viewer.
+    `name`: title, the quantity with its unit. `span`: of the horizontal axis. `values`: of the
+    vertical axis, from `readable_range`; by default set by the viewer.
     """
     return rrb.TimeSeriesView(
         origin=origin,

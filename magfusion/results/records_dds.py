@@ -32,27 +32,14 @@ DEPTH = 4096  # samples that may wait: a second of the fastest sensors
 
 
 class Subscription(NamedTuple):
-    """How messages of a topic become a part of a record.
+    """How messages of a topic become a part of a record."""
 
-    Parameters
-    ----------
-    topic : str
-        Name.
-    message : str
-        Its class in `magfusion.results.ros_messages`.
-    kind : str
-        Its type in ROS.
-    content : callable
-        Returns the part's keys of stamps (s) and messages.
-    sensor : str, optional
-        Aiding sensor of the site, which may have topics of several types.
-    """
-
-    topic: str
-    message: str
-    kind: str
+    topic: str  # name
+    message: str  # its class in `magfusion.results.ros_messages`
+    kind: str  # its type in ROS
+    # returns the part's keys of stamps (s) and messages
     content: Callable[[list[float], Sequence[Any]], dict[str, list[Any]]]
-    sensor: str | None = None
+    sensor: str | None = None  # aiding sensor of the site, which may have topics of several types
 
 
 def _imu_content(stamps: list[float], messages: Sequence[Any]) -> dict[str, list[Any]]:
@@ -126,16 +113,9 @@ def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[N
     """Return the samples of topics as they arrive, in the domain ``ROS_DOMAIN_ID``.
 
     Stamps are those of the headers, in seconds since 1970. Raises InputError where a topic or the
-    domain is invalid, or cyclonedds is not installed.
-
-    Parameters
-    ----------
-    topics : Topics, optional
-        Other names than the defaults.
-    site : Site
-        Of a platform without an IMU only the magnetometer is subscribed to.
-    messages : file
-        Receives a sentence on a topic without messages.
+    domain is invalid, or cyclonedds is not installed. `topics`: other names than the defaults.
+    `site`: of a platform without an IMU only the magnetometer is subscribed to. `messages`:
+    receives a sentence on a topic without messages.
     """
     if topics is not None and topics.truth is not None:
         raise InputError("--topics: truth is of a log; omit it with ros2:")

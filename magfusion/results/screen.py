@@ -39,14 +39,8 @@ def show(
 ) -> None:
     """Print the figures of a job for a reader; ``report.json`` has all of them.
 
-    Parameters
-    ----------
-    output : Path, optional
-        Directory of the results.
-    console : Console, optional
-        By default the standard output.
-    level : 'quiet', 'brief' or 'verbose'
-        The verdict in one line; what a decision requires; or all.
+    `output`: directory of the results. `console`: by default the standard output. `level`: the
+    verdict in one line; what a decision requires; or all.
     """
     console = Console(highlight=False, emoji=False) if console is None else console
     name = " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))

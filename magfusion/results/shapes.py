@@ -13,21 +13,11 @@ SMALLEST = 0.1  # m, of a scene: a tracker's
 
 
 class Scale(NamedTuple):
-    """Position and size of the scene, and the magnification of sigmas.
+    """Position and size of the scene, and the magnification of sigmas."""
 
-    Parameters
-    ----------
-    centre_world : ndarray, shape (3,)
-        (m)
-    size : float
-        Diagonal of the box around beacons and path (m).
-    sigma : int
-        Magnification: a power of ten.
-    """
-
-    centre_world: Array
-    size: float
-    sigma: int
+    centre_world: Array  # (3,) (m)
+    size: float  # diagonal of the box around beacons and path (m)
+    sigma: int  # magnification: a power of ten
 
     @property
     def grid(self) -> float:
@@ -63,12 +53,8 @@ def coil_loop(coil: Coil, usual_radius: float) -> Array:
 def coverage_shell(beacon: Beacon, level: float) -> list[Array]:
     """Return the equator and two meridians of the surface at a level of the field.
 
-    `level`: root mean square of the field over time (T).
-
-    Returns
-    -------
-    list of ndarray, shape (points, 3)
-        In beacon axes (m).
+    `level`: root mean square of the field over time (T). Returns lines, each of shape
+    (points, 3), in beacon axes (m).
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     along, across, none = np.cos(angle), np.sin(angle), np.zeros_like(angle)

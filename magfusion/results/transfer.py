@@ -25,12 +25,8 @@ def agreement(first: Estimated, second: Estimated) -> Array:
     gauge among them, agree without proof and are omitted.  In the others the pull of the survey is
     removed from the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance ``(K1 -
     K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
-    `first`, `second`: with the same parameters and priors.
-
-    Returns
-    -------
-    ndarray, shape (determined,)
-        Difference along each direction that both logs determine, in its own sigmas.
+    `first`, `second`: with the same parameters and priors. Returns (determined,), difference along
+    each direction that both logs determine, in its own sigmas.
     """
     # A log has its own phases: they refer to its own middle.
     kept = np.array([b.parameter != PHASE for b in first.blocks for _ in b.sigma], dtype=bool)

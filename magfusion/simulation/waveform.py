@@ -23,10 +23,6 @@ LEAST_SAMPLES_PER_CYCLE = 2.5
 USUAL_RATE_HZ, USUAL_SAMPLES_PER_SLOT = 400.0, 16
 
 
-def _vertical() -> Array:
-    return np.array([0.0, 0.0, 1.0])
-
-
 @dataclass(frozen=True, eq=False)
 class Mains:
     """Hum of power lines, uniform over the room."""
@@ -35,7 +31,7 @@ class Mains:
     frequency_hz: float = 50.0
     # amplitude of the second, third, ... harmonic relative to the fundamental
     harmonics: tuple[float, ...] = (0.1, 0.3)
-    direction_world: Array = field(default_factory=_vertical)  # (3,)
+    direction_world: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,)
 
 
 def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:

@@ -52,101 +52,60 @@ QUIET = 0.3  # sigmas; a last pass that moved the poses by less counts as conver
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """The posterior of one log.
+    """The posterior of one log."""
 
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity, biases and pose covariance, on the log's clock: at the fields, in gaps
-        between them, and at other measurements.
-    epoch : int ndarray, shape (n,)
-        State index of each field epoch.
-    fields : FieldSamples
-        The phasors of the last pass.
-    declared, calibration : Calibration
-        Before and after the estimation.
-    blocks : tuple of Block
-        Estimated parameters.
-    considered : tuple of Block
-        Parameters that are not estimated, but whose uncertainty is in the covariance.
-    field_errors : tuple of Block
-        Errors of the beacons' fields that are constant in place, with the same effect.
-    calibration_cov : ndarray, shape (dimension, dimension)
-    calibration_response : ndarray, shape (dimension, uncertain)
-        Change by one sigma of each uncertain parameter; included in that covariance.
-    residual : ndarray, shape (n, channels, 6)
-        Whitened; NaN where a channel is missing, or with loose coupling.
-    graph : Graph
-        As of the last optimisation.
-    estimate : GraphEstimate
-        Solution of ``graph``: the states, and the calibration of every segment of a long log.
-    rival_chi_square : float, optional
-        Excess chi square of the best trajectory from another chain of hypotheses, after its first
-        pass: if small, the log leaves a mirrored trajectory possible.  None without another
-        chain, or where all gave the same trajectory.
-    converged : bool
-        Whether the last pass moved the poses by nothing, or by little in units of their sigmas.
-    last_move : float
-        Root mean square of the pose changes in the last pass, in sigmas: that of the survey's
-        gauge is large.
-    rival : Trajectory, optional
-        That trajectory.
-    dropped : mapping
-        Reason to number of windows.
-    gap_bridged : int
-        Intervals with a gap in the inertial stream.
-    earth_residual : ndarray, shape (n, 3), optional
-        Whitened; None where the Earth field was not measured.
-    earth_disturbed : bool ndarray, shape (n,), optional
-        Where it is inconsistent with the motion.
-    fix_response : ndarray, shape (states, 6, parameters), optional
-        Change of every pose by one sigma of the survey, common to all, with loose coupling.
-    noise : tuple of Tuned
-        Estimated noise and model error, also in the site of ``calibration``.
-    open_signs : int
-        Amplitudes that the last pass omitted, since their sign was ambiguous.
-    standing : bool ndarray, shape (states,)
-        Where the platform is at rest.
-    log_name : str
-        Of the log.
-    epoch_ns : int
-        Zero of the log's clock.
-    trust : Trust, optional
-        After `magfusion.estimation.integrity.judge.judge_result`.
-    """
-
+    # with velocity, biases and pose covariance, on the log's clock: at the fields, in gaps between
+    # them, and at other measurements
     states: Trajectory
-    epoch: IntArray
-    fields: FieldSamples
+    epoch: IntArray  # (n,), state index of each field epoch
+    fields: FieldSamples  # the phasors of the last pass
+    # declared, calibration: before and after the estimation
     declared: Calibration
     calibration: Calibration
-    blocks: tuple[Block, ...]
+    blocks: tuple[Block, ...]  # estimated parameters
+    # parameters that are not estimated, but whose uncertainty is in the covariance
     considered: tuple[Block, ...]
-    calibration_cov: Array
+    calibration_cov: Array  # (dimension, dimension)
+    # (n, channels, 6), whitened; NaN where a channel is missing, or with loose coupling
     residual: Array
     start: Start
-    graph: Graph
+    graph: Graph  # as of the last optimisation
+    # solution of ``graph``: the states, and the calibration of every segment of a long log
     estimate: GraphEstimate
+    # excess chi square of the best trajectory from another chain of hypotheses, after its first
+    # pass: if small, the log leaves a mirrored trajectory possible. None without another chain, or
+    # where all gave the same trajectory
     rival_chi_square: float | None
-    dropped: Mapping[str, int]
-    gap_bridged: int
+    dropped: Mapping[str, int]  # reason to number of windows
+    gap_bridged: int  # intervals with a gap in the inertial stream
     cost: float
     iteration_count: int
     iterations: int
+    # whether the last pass moved the poses by nothing, or by little in units of their sigmas
     converged: bool
+    # root mean square of the pose changes in the last pass, in sigmas: that of the survey's gauge
+    # is large
     last_move: float = 0.0
-    rival: Trajectory | None = None
+    rival: Trajectory | None = None  # that trajectory
+    # (n, 3), whitened; None where the Earth field was not measured
     earth_residual: Array | None = None
-    earth_disturbed: BoolArray | None = None
+    earth_disturbed: BoolArray | None = None  # (n,), where it is inconsistent with the motion
+    # (states, 6, parameters), change of every pose by one sigma of the survey, common to all, with
+    # loose coupling
     fix_response: Array | None = None
+    # estimated noise and model error, also in the site of ``calibration``
     noise: tuple[Tuned, ...] = ()
-    open_signs: int = 0
+    open_signs: int = 0  # amplitudes that the last pass omitted, since their sign was ambiguous
+    # errors of the beacons' fields that are constant in place, with the same effect
     field_errors: tuple[Block, ...] = ()
+    # (dimension, uncertain), change by one sigma of each uncertain parameter; included in that
+    # covariance
     calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # (states,), where the platform is at rest
     standing: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    log_name: str = ""
-    epoch_ns: int = 0
-    trust: Trust | None = None
+    log_name: str = ""  # of the log
+    epoch_ns: int = 0  # zero of the log's clock
+    trust: Trust | None = None  # after `magfusion.estimation.integrity.judge.judge_result`
 
     def __repr__(self) -> str:
         time, beacons = self.states.time, len(self.calibration.site.beacons)

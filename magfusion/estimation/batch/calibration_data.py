@@ -54,18 +54,19 @@ def _changed(before: Any, data: Any, names: set[str]) -> Any:
     wrong = "has a value that does not match the type or shape of the site's value"
     old = _parts(before)
     if old is None:
-        _check(np.asarray(data).dtype == np.float64 and np.all(np.isfinite(data)), wrong)
-        _check(before is None or type(before) is type(data), wrong)
-        _check(before is None or np.shape(before) == np.shape(data), wrong)
+        require(np.asarray(data).dtype == np.float64 and np.all(np.isfinite(data)), wrong)
+        require(before is None or type(before) is type(data), wrong)
+        require(before is None or np.shape(before) == np.shape(data), wrong)
         return data
     known = old.keys() | (names if isinstance(before, Mapping) else set())
-    _check(isinstance(data, dict) and data.keys() <= known, wrong)
+    require(isinstance(data, dict) and data.keys() <= known, wrong)
     changed = {name: _changed(old.get(name), value, names) for name, value in data.items()}
     if isinstance(before, tuple):
         return tuple({**old, **changed}.values())
     return {**old, **changed} if isinstance(before, Mapping) else replace(before, **changed)
 
 
-def _check(right: bool | np.bool_, wrong: str) -> None:
+def require(right: bool | np.bool_, wrong: str) -> None:
+    """Raise ValueError with a message where a condition does not hold."""
     if not right:
         raise ValueError(wrong)

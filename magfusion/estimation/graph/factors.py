@@ -33,14 +33,8 @@ def _constant(key: int) -> Key:
 class Factors:
     """Linear factors of a measurement, one per epoch, on its state and on the calibration.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        Of one segment.
-    blocks : tuple of Block
-        Calibration parameters that are estimated.
-    own : tuple of int and int ndarray, optional
-        Key of the segment's own variable, and its columns of the calibration.
+    `measurement`: of one segment. `blocks`: calibration parameters that are estimated. `own`: key
+    of the segment's own variable, and its columns of the calibration.
     """
 
     def __init__(

@@ -211,21 +211,10 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     """Return two steps with the same integral as many.
 
     Constant over each step, they give the rotations of the halves, and together velocity and
-    position of the whole.
-
-    Parameters
-    ----------
-    steps : ndarray, shape (7, k, 2, n)
-        Rate, specific force and length of the single steps of both halves.
-    bias : ndarray, shape (6, n)
-        Of gyro and accelerometer (rad/s, m/s^2).
-
-    Returns
-    -------
-    both : ndarray, shape (7, 2, n)
-        Rate, specific force and length.
-    gentle : ndarray of bool, shape (n,)
-        Whether the rotation of both halves is small.
+    position of the whole. `steps` (7, k, 2, n): rate, specific force and length of the single steps
+    of both halves. `bias` (6, n): of gyro and accelerometer (rad/s, m/s^2). Returns
+    `both` (7, 2, n): rate, specific force and length; `gentle` (n,): whether the rotation of both
+    halves is small.
     """
     single, angle = _of_steps(steps, bias)
     halves = _one_after_the_other(single)

@@ -37,10 +37,7 @@ def prior_factor(
 ) -> gtsam.JacobianFactor:
     """Return the prior at a calibration.
 
-    Parameters
-    ----------
-    shift : ndarray, shape (dimension, n), optional
-        Shift of its mean by a unit of each fixed parameter.
+    `shift` (dimension, n): shift of its mean by a unit of each fixed parameter.
     """
     sqrt_information = prior_sqrt_information(declared.site, blocks)
     error = -sqrt_information @ difference(declared, calibration, blocks)

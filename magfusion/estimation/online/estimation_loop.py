@@ -31,18 +31,9 @@ MARGIN = 0.5  # s; of a span that a start uses
 class EstimationLoop:
     """The parts of a navigator, and the order in which they process its data.
 
-    Attributes
-    ----------
-    corrections : AppliedCorrections
-        Mistakes of the declared site that are undone.
-    possible : tuple of Correction
-        What may be wrong with the site, the most likely first.
-    tried : Correction, optional
-        Which the site includes on trial.
-    remainder : Correction, optional
-        Of a corrected parameter, by what it still seems to be wrong.
-    rival_chi_square : float, optional
-        As of `magfusion.estimation.initialization.online.OnlineStart`.
+    Attributes: `possible`: what may be wrong with the site, the most likely first. `tried`: which
+    the site includes on trial. `remainder`: of a corrected parameter, by what it still seems to be
+    wrong.
     """
 
     arrived: Arrivals
@@ -50,8 +41,8 @@ class EstimationLoop:
     search: StartSearch
     reports: StateReports
     now: StateOfNow
-    corrections: AppliedCorrections
-    rival_chi_square: float | None
+    corrections: AppliedCorrections  # mistakes of the declared site that are undone
+    rival_chi_square: float | None  # as of `magfusion.estimation.initialization.online.OnlineStart`
 
     def __init__(self, site: Site, settings: NavigatorSettings) -> None:
         self.site, self.settings = site, settings

@@ -29,22 +29,12 @@ UNDETECTED = 1.0  # s without a beacon, longer than any window, before the sigma
 class LossRecovery:
     """Attempts to recover a lost or uncertain state by a fix from the beacons that agree.
 
-    Parameters
-    ----------
-    gate : Gate
-        Knows whether the state explains no measurement any more.
-    blocks : tuple of Block
-        Calibration parameters in the states' tangent.
-    lost_beyond : float
-        As of `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m).
-
-    Attributes
-    ----------
-    detected_at : float
-        When a beacon was last detected (s).
+    `gate`: knows whether the state explains no measurement any more. `blocks`: calibration
+    parameters in the states' tangent. `lost_beyond`: as of
+    `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m).
     """
 
-    detected_at: float
+    detected_at: float  # when a beacon was last detected (s)
     _attempts: Attempts
     _pointing: Attempts
 

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch.calibration_data import calibration_rules
+from magfusion.estimation.batch.calibration_data import calibration_rules, require
 from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
@@ -54,7 +54,7 @@ ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 
 def _made_again(data: Any) -> Predictions:
-    _check(data is None, "contains predictions, which are not stored")
+    require(data is None, "contains predictions, which are not stored")
     return Predictions()
 
 
@@ -103,7 +103,7 @@ def navigator_rules(
             WindowPrior: lambda prior: _check_prior(prior, size),
             Buffer: _check_buffer,
             Bursts: _check_bursts,
-            FieldSamples: lambda f: _check(f.channels == site.channels, "has other channels"),
+            FieldSamples: lambda f: require(f.channels == site.channels, "has other channels"),
             SlidingWindow: lambda window: _check_window(window),
         },
     )
@@ -132,19 +132,14 @@ def _finding_data(finding: Finding) -> Any:
 def _finding(data: Any) -> Finding:
     own = from_plain(_FindingData, data, "finding", _OF_FINDING)
     remedy = json.loads(own.remedy)
-    _check(remedy is None or isinstance(remedy, dict), "has a remedy that is none")
+    require(remedy is None or isinstance(remedy, dict), "has a remedy that is none")
     return Finding(**(vars(own) | {"remedy": remedy}))
 
 
 def _levels(data: Any) -> Levels:
     right = isinstance(data, list) and len(data) == 2
-    _check(right and all(x is None or type(x) is float for x in data), "is not a pair of levels")
+    require(right and all(x is None or type(x) is float for x in data), "is not a pair of levels")
     return Levels((data[0], data[1]))
-
-
-def _check(right: bool | np.bool_, wrong: str) -> None:
-    if not right:
-        raise ValueError(wrong)
 
 
 def _check_bursts(bursts: Bursts) -> None:
@@ -155,22 +150,22 @@ def _check_bursts(bursts: Bursts) -> None:
         len(marks.slot),
         len(bursts.epochs(bursts.numbers)),
     }
-    _check(len(lengths) == 1, "has columns of different length")
+    require(len(lengths) == 1, "has columns of different length")
     edges = np.stack([marks.begin, marks.end], axis=1).ravel()
-    _check(np.all(np.diff(edges) > -OVERLAP), "has bursts that overlap")
+    require(np.all(np.diff(edges) > -OVERLAP), "has bursts that overlap")
 
 
 def _check_state(state: State, size: int) -> None:
     shapes = {"world_from_body": (3, 3), "cov": (size, size)}
     for name, value in vars(state).items():
         if isinstance(value, np.ndarray):
-            _check(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
-            _check(np.all(np.isfinite(value)), f"has a {name} that is not finite")
-    _check(np.isfinite(state.time), "has a time that is not finite")
+            require(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
+            require(np.all(np.isfinite(value)), f"has a {name} that is not finite")
+    require(np.isfinite(state.time), "has a time that is not finite")
     bias = np.concatenate([state.gyro_bias_body, state.accel_bias_body])
-    _check(not beyond_range(bias[None])[0], "has a bias that no instrument has")
+    require(not beyond_range(bias[None])[0], "has a bias that no instrument has")
     rotated = state.world_from_body @ state.world_from_body.T
-    _check(np.max(np.abs(rotated - np.eye(3))) < ROUNDING, "has an invalid rotation")
+    require(np.max(np.abs(rotated - np.eye(3))) < ROUNDING, "has an invalid rotation")
     _check_cov(state.cov)
 
 
@@ -178,56 +173,56 @@ def _check_judgement(judgement: Judgement) -> None:
     levels = (judgement.protection_level_m, judgement.protection_level_deg)
     known = [level for level in levels if level is not None]
     values = (judgement.inflation, judgement.turn, judgement.shift, *known)
-    _check(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is not a valid judgement")
+    require(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is not a valid judgement")
 
 
 def _check_running(running: DecayingSums) -> None:
     sums = (*running.total, running.weight, running.squares)
-    _check(running.total.ndim == 1 and np.all(np.isfinite(sums)), "is not finite")
+    require(running.total.ndim == 1 and np.all(np.isfinite(sums)), "is not finite")
 
 
 def _check_sums(sums: Sums) -> None:
     size, states = len(sums.gradient), sums.response.shape[:1]
     shapes = (sums.information.shape, sums.gradient.shape, sums.response.shape)
-    _check(shapes == ((size, size), (size,), (*states, size)), "has sums of another shape")
+    require(shapes == ((size, size), (size,), (*states, size)), "has sums of another shape")
     parts = (sums.information, sums.gradient, sums.response, sums.onsets, sums.time)
-    _check(all(np.all(np.isfinite(part)) for part in parts), "has sums that are not finite")
+    require(all(np.all(np.isfinite(part)) for part in parts), "has sums that are not finite")
 
 
 def _check_cov(cov: Array) -> None:
     sigma = np.sqrt(np.maximum(np.diagonal(cov), np.finfo(float).tiny))
     correlation = cov / sigma / sigma[:, None]
-    _check(np.all(np.isfinite(correlation)), "has a covariance that is not finite")
-    _check(np.max(np.abs(correlation - correlation.T)) < ROUNDING, "has an asymmetric covariance")
+    require(np.all(np.isfinite(correlation)), "has a covariance that is not finite")
+    require(np.max(np.abs(correlation - correlation.T)) < ROUNDING, "has an asymmetric covariance")
     least = np.linalg.eigvalsh(correlation)[0]
-    _check(least > -ROUNDING, "has a covariance that is not positive definite")
+    require(least > -ROUNDING, "has a covariance that is not positive definite")
 
 
 def _check_node(node: Node, blocks: tuple[Block, ...]) -> None:
     state = states_of([node.state])
     for measurement in node.measurements:
         rows = measurement.linearize(state, node.state.calibration, blocks)
-        _check(len(measurement.epoch) == 1, "contains a measurement of several epochs")
-        _check(np.all(np.isfinite(rows.error)), "contains a measurement that is not finite")
+        require(len(measurement.epoch) == 1, "contains a measurement of several epochs")
+        require(np.all(np.isfinite(rows.error)), "contains a measurement that is not finite")
 
 
 def _check_prior(prior: WindowPrior, size: int) -> None:
     matrix, right = prior.sqrt_information, prior.right
-    _check(matrix.ndim == 2 and matrix.shape[1] == size, "has a matrix of another shape")
-    _check(right.shape == matrix.shape[:1], "has a right-hand side of another shape")
-    _check(np.all(np.isfinite(matrix)) and np.all(np.isfinite(right)), "is not finite")
+    require(matrix.ndim == 2 and matrix.shape[1] == size, "has a matrix of another shape")
+    require(right.shape == matrix.shape[:1], "has a right-hand side of another shape")
+    require(np.all(np.isfinite(matrix)) and np.all(np.isfinite(right)), "is not finite")
 
 
 def _check_buffer(buffer: Buffer) -> None:
     time, rows = buffer.rows()
-    _check(time.ndim == 1 and rows.shape == (len(time), buffer.width), "has another shape")
-    _check(np.all(np.isfinite(time)) and np.all(np.isfinite(rows)), "is not finite")
-    _check(np.all(np.diff(time) > 0.0), "is not sorted by time")
+    require(time.ndim == 1 and rows.shape == (len(time), buffer.width), "has another shape")
+    require(np.all(np.isfinite(time)) and np.all(np.isfinite(rows)), "is not finite")
+    require(np.all(np.diff(time) > 0.0), "is not sorted by time")
 
 
 def _check_window(window: SlidingWindow) -> None:
-    _check(np.all(np.diff([n.state.time for n in window.nodes]) > 0.0), "is not sorted by time")
-    _check(all(node.link for node in window.nodes[1:]), "has nodes that are not linked")
+    require(np.all(np.diff([n.state.time for n in window.nodes]) > 0.0), "is not sorted by time")
+    require(all(node.link for node in window.nodes[1:]), "has nodes that are not linked")
 
 
 def _refuse_factors(_: UserFactors) -> NoReturn:
@@ -247,7 +242,7 @@ def _measurement_data(measurement: Measurement) -> dict[str, Any]:
 
 
 def _measurement(data: Any, kinds: Mapping[str, type[Measurement]]) -> Measurement:
-    _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of an unknown kind")
+    require(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of an unknown kind")
     own = {name: value for name, value in data.items() if name != "kind"}
     return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _WITHOUT_PREDICTIONS)
 
@@ -267,7 +262,7 @@ def _link_data(link: Link, rules: Rules) -> Any:
 def _link(data: Any, site: Site, columns: int, rules: Rules) -> Link:
     result = from_plain(_LinkData, data, "link", rules)
     if (by := result.by_calibration) is not None:
-        _check(by.shape == (ROWS, columns) and np.all(np.isfinite(by)), "has a wrong derivative")
+        require(by.shape == (ROWS, columns) and np.all(np.isfinite(by)), "has a wrong derivative")
     measurement = result.steps.preintegrated(site)
     return Link(measurement, result.by_calibration, result.calibration, result.steps)
 
@@ -276,8 +271,10 @@ def _check_steps(steps: Steps) -> None:
     own, biases = steps.increments, (steps.accel_bias_body, steps.gyro_bias_body)
     count = len(own.dt)
     shapes = (own.gyro_body.shape, own.accel_body.shape, own.dt.shape)
-    _check(shapes == ((count, 3), (count, 3), (count,)), "has steps of another shape")
-    _check(biases[0].shape == biases[1].shape == (3,), "has biases of another shape")
-    _check(own.first.tolist() == [0, count] and len(own.gap_bridged) == 1, "is not of one interval")
+    require(shapes == ((count, 3), (count, 3), (count,)), "has steps of another shape")
+    require(biases[0].shape == biases[1].shape == (3,), "has biases of another shape")
+    require(
+        own.first.tolist() == [0, count] and len(own.gap_bridged) == 1, "is not of one interval"
+    )
     values = np.concatenate([v.ravel() for v in (*vars(own).values(), *biases)])
-    _check(np.all(np.isfinite(values)) and np.all(own.dt > 0.0), "has steps that are not finite")
+    require(np.all(np.isfinite(values)) and np.all(own.dt > 0.0), "has steps that are not finite")

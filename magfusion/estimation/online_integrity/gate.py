@@ -22,27 +22,15 @@ MEMORY = 0.95  # of the running mean of the distortion, per epoch
 
 
 class Gate:
-    """Rejects outliers, and detects a wrong state.
+    """Rejects outliers, and detects a wrong state."""
 
-    Attributes
-    ----------
-    counts : Counter
-        Outliers by beacon.
-    distortion : dict of str to float
-        By beacon, running mean of the squared innovation in units of its expectation.
-    refused_in_a_row : int
-        Consecutive epochs with most channels rejected, up to now.
-    outvoted_in_a_row : int
-        Consecutive epochs in which no majority of the beacons was accepted.
-    accepted, refused : dict of str to float
-        Of the last epoch, by beacon, the mean squared innovation of the accepted and of the
-        rejected channels, in the same units.
-    """
-
-    counts: Counter[str]
+    counts: Counter[str]  # outliers by beacon
+    # by beacon, running mean of the squared innovation in units of its expectation
     distortion: dict[str, float]
-    refused_in_a_row: int
-    outvoted_in_a_row: int
+    refused_in_a_row: int  # consecutive epochs with most channels rejected, up to now
+    outvoted_in_a_row: int  # consecutive epochs in which no majority of the beacons was accepted
+    # accepted, refused: of the last epoch, by beacon, the mean squared innovation of the accepted
+    # and of the rejected channels, in the same units
     accepted: dict[str, float]
     refused: dict[str, float]
     _limit: Array

@@ -55,19 +55,9 @@ MOST_WAITING = 10  # epochs; larger batches would delay an update
 class OnlineScore:
     """Score test of a running estimate's fixed parameters; of many beacons, of detected ones.
 
-    Parameters
-    ----------
-    estimated, considered : tuple of Block
-        Calibration parameters in the state's tangent.
-    steady : bool
-        Whether the static field is measured.
-
-    Attributes
-    ----------
-    correction : Correction, optional
-        Of the cause in the last result, if there is one.
-    named : tuple of str
-        Owners of the parameters in the last result: of the cause, and what explains it as well.
+    `estimated`, `considered`: calibration parameters in the state's tangent. `steady`: whether the
+    static field is measured. Attribute `correction`: of the cause in the last result, if there is
+    one.
     """
 
     _sums: Sums | None
@@ -75,6 +65,7 @@ class OnlineScore:
     _scored_at: float
     _epochs_since_score: int  # epochs since the last result
     _judgement: Judgement
+    # owners of the parameters in the last result: of the cause, and what explains it as well
     named: tuple[str, ...]
 
     def __init__(

@@ -33,10 +33,7 @@ def frame_pairs(reader: AnyReader, topic: str) -> list[Frames]:
 def frame_chain(pairs: Sequence[Frames], frames: Frames) -> list[tuple[Frames, bool]] | None:
     """Return the shortest chain of transforms between two frames; None where there is none.
 
-    Returns
-    -------
-    list of tuple, or None
-        Parent and child of each transform, and whether it is inverted.
+    Each transform is given by parent and child, and whether it is inverted.
     """
     steps: dict[str, list[tuple[str, tuple[Frames, bool]]]] = defaultdict(list)
     for parent, child in pairs:

@@ -36,38 +36,25 @@ LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see no
 
 @dataclass
 class Counts:
-    """What became of the rows of a table.
-
-    Parameters
-    ----------
-    missing : int
-        Rows written with NaN: samples that were not taken.
-    left_out : dict
-        Rows that were not written, by the reason.
-    unsorted : int
-        Rows that were before the row above, and were put in their place.
-    batched : bool
-        Whether many rows have the stamp of the row above: they are judged when all are read.
-    scaled : float
-        Largest deviation of a quaternion's length from one, that was scaled to one.
-    batches : str
-        What became of samples of which several have one stamp; empty where none did.
-    first, last : int
-        Stamps (ns).
-    newest, wrapped : int
-        Stamp of the last row that was read, and what its counter lost by wrapping until then (ns).
-    """
+    """What became of the rows of a table."""
 
     read: int = 0
     written: int = 0
-    missing: int = 0
-    unsorted: int = 0
+    missing: int = 0  # rows written with NaN: samples that were not taken
+    unsorted: int = 0  # rows that were before the row above, and were put in their place
+    # whether many rows have the stamp of the row above: they are judged when all are read
     batched: bool = False
+    # largest deviation of a quaternion's length from one, that was scaled to one
     scaled: float = 0.0
+    # what became of samples of which several have one stamp; empty where none did
     batches: str = ""
+    # rows that were not written, by the reason
     left_out: dict[str, int] = field(default_factory=dict)
+    # first, last: stamps (ns)
     first: int = LARGEST_TIME_NS
     last: int = -LARGEST_TIME_NS
+    # newest, wrapped: stamp of the last row that was read, and what its counter lost by wrapping
+    # until then (ns)
     newest: int = -LARGEST_TIME_NS
     wrapped: int = 0
 

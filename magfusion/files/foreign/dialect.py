@@ -31,27 +31,15 @@ _DATE = re.compile(rf"(\d{{4}}[-/]\d\d[-/]\d\d|\d\d\.\d\d\.\d{{4}})([T ]{_CLOCK}
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a table of text is written.
+    """How a table of text is written."""
 
-    Parameters
-    ----------
-    delimiter : str
-        A space means runs of spaces and tabulators.
-    offset : int
-        Of the first row of data in the file (bytes).
-    line : int
-        The same as a line, counted from 1.
-    missing : tuple of str
-        What is written where there is no number.
-    """
-
-    delimiter: str
+    delimiter: str  # a space means runs of spaces and tabulators
     decimal: str
     encoding: str
-    offset: int
-    line: int
+    offset: int  # of the first row of data in the file (bytes)
+    line: int  # the same as a line, counted from 1
     columns: tuple[SourceColumn, ...]
-    missing: tuple[str, ...] = MISSING
+    missing: tuple[str, ...] = MISSING  # what is written where there is no number
 
     def __str__(self) -> str:
         words = {sign: word for word, sign in WORDS.items()}

@@ -30,19 +30,13 @@ _TRUTH = "truth.quaternion=qw,qx,qy,qz[wxyz]"
 
 @dataclass(frozen=True)
 class FlightFormat:
-    """A format of flight logs.
-
-    Parameters
-    ----------
-    read : callable
-        Takes a path and the names of messages; returns the columns of each, with ``time_ns`` and,
-        of attitudes, the quaternion ned_from_frd in ``qw``, ``qx``, ``qy``, ``qz``.
-    maps : dict
-        Messages, the preferred one of a stream first, and how each makes its stream.
-    """
+    """A format of flight logs."""
 
     name: str
+    # takes a path and the names of messages; returns the columns of each, with ``time_ns`` and, of
+    # attitudes, the quaternion ned_from_frd in ``qw``, ``qx``, ``qy``, ``qz``
     read: Callable[[Path, Collection[str]], dict[str, dict[str, AnyArray]]]
+    # messages, the preferred one of a stream first, and how each makes its stream
     maps: dict[str, tuple[str, ...]]
 
 

@@ -30,23 +30,15 @@ INERTIAL = {"imu", *HALVES}
 
 @dataclass(eq=False)
 class GatheredStreams:
-    """Streams of one recording.
-
-    Parameters
-    ----------
-    bags : list of sequence of Path
-        Of each recording.
-    passed_over : list of str
-        Files in the folder that are no tables, and why.
-    stamped : bool
-        Whether the formats have their own convention of an epoch: the first inertial sample.
-    """
+    """Streams of one recording."""
 
     findings: Findings
     plans: dict[str, ImportPlan] = field(default_factory=dict)
-    bags: list[Sequence[Path]] = field(default_factory=list)
+    bags: list[Sequence[Path]] = field(default_factory=list)  # of each recording
+    # whether the formats have their own convention of an epoch: the first inertial sample
     stamped: bool = False
     opened: dict[Path, Source] = field(default_factory=dict)
+    # files in the folder that are no tables, and why
     passed_over: list[str] = field(default_factory=list)
     phasors: PhasorPlan | None = None
 

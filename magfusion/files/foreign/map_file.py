@@ -38,36 +38,19 @@ class MapFile(StrictModel):
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """Request of an import.
+    """Request of an import."""
 
-    Parameters
-    ----------
-    files : dict
-        Of streams that are named.
-    entries : dict
-        By stream.
-    shifts_ns : dict
-        Added to the times of a stream.
-    rows : dict
-        Column, and the value that rows of the stream have in it.
-    missing : tuple of str
-        Markers of missing values.
-    sigma : float, optional
-        Of phasors whose table has none (T).
-    recorded : bool
-        Whether the magnetometer is a recording, which is no table.
-    """
-
-    files: dict[str, Path]
-    entries: dict[str, list[ColumnMapping]]
+    files: dict[str, Path]  # of streams that are named
+    entries: dict[str, list[ColumnMapping]]  # by stream
     rates: dict[str, Rate] = field(default_factory=dict)
     delimiter: str | None = None
     epoch: str | None = None
-    shifts_ns: dict[str, int] = field(default_factory=dict)
+    shifts_ns: dict[str, int] = field(default_factory=dict)  # added to the times of a stream
+    # column, and the value that rows of the stream have in it
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
-    sigma: float | None = None
-    recorded: bool = False
+    missing: tuple[str, ...] = ()  # markers of missing values
+    sigma: float | None = None  # of phasors whose table has none (T)
+    recorded: bool = False  # whether the magnetometer is a recording, which is no table
 
 
 def read_request(

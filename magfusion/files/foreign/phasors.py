@@ -49,27 +49,17 @@ LIKELY_UNITS = ("T", "uT", "nT", "pT")
 
 @dataclass(frozen=True, eq=False)
 class PhasorPlan:
-    """How a table becomes the fields of a log.
-
-    Parameters
-    ----------
-    terms : dict
-        Columns of rows, as in `_NAMES`; of a table by coil the time alone.
-    coils : dict
-        Columns of each (beacon, tone), or of `AMBIENT`; empty where each row is of one coil.
-    frame : int
-        Rows of one cycle of slots, where the table has one column; otherwise 0.
-    sigma : float, optional
-        Where the table has none (T).
-    """
+    """How a table becomes the fields of a log."""
 
     source: Source
+    # columns of rows, as in `_NAMES`; of a table by coil the time alone
     terms: dict[str, tuple[Term, ...]]
+    # columns of each (beacon, tone), or of `AMBIENT`; empty where each row is of one coil
     coils: dict[tuple[str, int] | str, tuple[Term, ...]]
     rate: Rate | None = None
     shift_ns: int = 0
-    frame: int = 0
-    sigma: float | None = None
+    frame: int = 0  # rows of one cycle of slots, where the table has one column; otherwise 0
+    sigma: float | None = None  # where the table has none (T)
     site: Site | None = None
     stream: str = FIELDS
 

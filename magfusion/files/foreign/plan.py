@@ -38,16 +38,10 @@ Terms = dict[str, tuple[Term, ...]]
 
 @dataclass(frozen=True)
 class Rate:
-    """Stamps of a table that has none.
-
-    Parameters
-    ----------
-    hz : fraction
-    start_s : fraction, optional
-        Of the first row; by default 0, and of a bag the stamp of the first message.
-    """
+    """Stamps of a table that has none."""
 
     hz: Fraction
+    # of the first row; by default 0, and of a bag the stamp of the first message
     start_s: Fraction | None = None
 
 

@@ -39,29 +39,14 @@ Read = Callable[[Sequence[int], Collection[int]], Iterator[RowBlock]]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A table.
+    """A table."""
 
-    Parameters
-    ----------
-    place : str
-        What a refusal calls it.
-    read : callable
-        Takes the places of the columns to read and, of these, the ones that hold stamps and are
-        given as they are written; yields `RowBlock`.
-    rate_hz : float, optional
-        That the format itself declares.
-    lengths : tuple of int
-        Rows of each column where they may differ, else empty.
-    form : str
-        How the table was understood, for the report.
-    count : int
-        Rows, if the format gives their number; else 0.
-    """
-
-    place: str
+    place: str  # what a refusal calls it
     columns: tuple[SourceColumn, ...]
+    # takes the places of the columns to read and, of these, the ones that hold stamps and are given
+    # as they are written; yields `RowBlock`
     read: Read
-    rate_hz: float | None = None
-    lengths: tuple[int, ...] = ()
-    form: str = ""
-    count: int = 0
+    rate_hz: float | None = None  # that the format itself declares
+    lengths: tuple[int, ...] = ()  # rows of each column where they may differ, else empty
+    form: str = ""  # how the table was understood, for the report
+    count: int = 0  # rows, if the format gives their number; else 0

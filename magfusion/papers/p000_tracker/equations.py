@@ -53,23 +53,15 @@ def eq_05_coupling(
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The five matrices of Eq 9, each of shape (3, 3).
+    """The five matrices of Eq 9, each of shape (3, 3)."""
 
-    Parameters
-    ----------
-    transmitter_rotation, transmitter_shift : ndarray
-        Q and C.
-    receiver_rotation, receiver_shift : ndarray
-        T and B.
-    ambient : ndarray
-        A.
-    """
-
+    # transmitter_rotation, transmitter_shift: Q and C
     transmitter_rotation: Array
     transmitter_shift: Array
+    # receiver_rotation, receiver_shift: T and B
     receiver_rotation: Array
     receiver_shift: Array
-    ambient: Array
+    ambient: Array  # A
 
     def driven(self, drive: Array) -> Array:
         """Return ``(X - C) Q``."""
@@ -84,15 +76,9 @@ def eq_09_whitened(coupling: Array, receiver: Array, transmitter: Array) -> Arra
     """Return the couplings with both antennas removed, ``T Y (Q X)^-1``.
 
     Corrected: T on the left, where it mixes receiving coils, and Q the map of moments.
-
-    Parameters
-    ----------
-    coupling : ndarray, shape (..., 3, 3)
-        Without the ambient field.
-    receiver : ndarray, shape (..., 3, 3)
-        T: the inverse of the receiving coils' sensitivities, row by row.
-    transmitter : ndarray, shape (..., 3, 3)
-        Q X: the moments as columns.
+    `coupling` (..., 3, 3): without the ambient field. `receiver` (..., 3, 3): T, the inverse of the
+    receiving coils' sensitivities, row by row. `transmitter` (..., 3, 3): Q X, the moments as
+    columns.
     """
     return receiver @ coupling @ np.linalg.inv(transmitter)
 

@@ -15,24 +15,14 @@ from magfusion.units import MU0_OVER_4PI, Array
 
 @dataclass(frozen=True, eq=False)
 class TrackerFix:
-    """Pose of a sensor relative to one beacon.
+    """Pose of a sensor relative to one beacon."""
 
-    Parameters
-    ----------
-    sensor_from_beacon : ndarray, shape (..., 3, 3)
-        The paper's H.
-    position_beacon : ndarray, shape (..., 2, 3)
-        The two positions that fit, opposite each other (m), in arbitrary order until `nearest`
-        puts the wanted hemisphere first.
-    distance : ndarray, shape (...)
-        (m)
-    residual : ndarray, shape (...)
-        Unmodelled part relative to the coupling: singular values that are not 2 : 1 : 1.
-    """
-
-    sensor_from_beacon: Array
+    sensor_from_beacon: Array  # (..., 3, 3), the paper's H
+    # (..., 2, 3), the two positions that fit, opposite each other (m), in arbitrary order until
+    # `nearest` puts the wanted hemisphere first
     position_beacon: Array
-    distance: Array
+    distance: Array  # (...) (m)
+    # (...), unmodelled part relative to the coupling: singular values that are not 2 : 1 : 1
     residual: Array
 
     def nearest(self, guess_beacon: Array) -> "TrackerFix":
@@ -53,11 +43,8 @@ def locate_by_svd(unit: Array) -> TrackerFix:
     The field of unit moments, sensor axes by beacon axes (..., 3, 3), is
     ``U = (K/R^3) H (3 u u^T - 1)`` and has singular values 2 : 1 : 1, the first along the bearing;
     H is the remaining factor: the solution of Wahba's problem and also the polar factor of Eq 11.
-
-    Raises
-    ------
-    EstimationError
-        Where a determinant is not positive, which no pose of a right-handed tracker gives.
+    Raises EstimationError where a determinant is not positive, which no pose of a right-handed
+    tracker gives.
     """
     _refuse_mirrored(unit)
     residual, size, right = np.linalg.svd(unit)

@@ -33,23 +33,16 @@ THREE_ANGLES = (
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Attitudes consistent with a field vector, the usual one first.
+    """Attitudes consistent with a field vector, the usual one first."""
 
-    Parameters
-    ----------
-    rpy : ndarray, shape (..., hypotheses, 3)
-        Roll, pitch, yaw (rad); NaN where there is no second solution of the pitch.
-    sigma : ndarray, shape (..., hypotheses, 3)
-        (rad); zero for a given angle, NaN or infinite where one is not determined.
-    residual : ndarray, shape (..., hypotheses)
-        Distance of the measured field from the matched one (T).
-    determined : bool ndarray, shape (..., hypotheses)
-        False at the fold, or where the measured field is outside the database.
-    """
-
+    # (..., hypotheses, 3), roll, pitch, yaw (rad); NaN where there is no second solution of the
+    # pitch
     rpy: Array
+    # (..., hypotheses, 3) (rad); zero for a given angle, NaN or infinite where one is not
+    # determined
     sigma: Array
-    residual: Array
+    residual: Array  # (..., hypotheses), distance of the measured field from the matched one (T)
+    # (..., hypotheses), False at the fold, or where the measured field is outside the database
     determined: BoolArray
 
     @property
@@ -90,10 +83,7 @@ def match_roll(
 ) -> Matches:
     """Return the maximum-likelihood roll for given pitch and yaw (atan2).
 
-    Raises
-    ------
-    InputError
-        Where the axis of roll lies along the field.
+    Raises InputError where the axis of roll lies along the field.
     """
     check_roll_axis(pitch, yaw, field_world)
     roll = roll_about(field_body, np.asarray(pitch), yaw, field_world)
@@ -110,12 +100,8 @@ def match_roll_pitch(
     """Return the maximum-likelihood roll and pitch for given yaw, both solutions.
 
     The first is on the given side of the fold (`fold_side`), by default that of a level body.  Yaws
-    (...) give a family of attitudes.
-
-    Raises
-    ------
-    InputError
-        Where the field has no component in the plane of pitch.
+    (...) give a family of attitudes. Raises InputError where the field has no component in the
+    plane of pitch.
     """
     along, _, down = _in_heading(yaw, field_world)
     size = float(np.linalg.norm(field_world))
@@ -169,12 +155,7 @@ def roll_about(field_body: Array, pitch: Array, yaw: Array | float, field_world:
 
 
 def check_roll_axis(pitch: float, yaw: float, field_world: Array) -> None:
-    """Raise an error if the axis of roll lies along the field.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError if the axis of roll lies along the field."""
     still = predict_field(np.array([0.0, pitch, yaw]), field_world)
     if np.hypot(still[1], still[2]) < LEAST_SHARE * np.linalg.norm(field_world):
         raise InputError(
@@ -209,12 +190,8 @@ def attitude_with_gravity(
     """Return world_from_body (..., 3, 3) from the field and, at rest, gravity: maximum likelihood.
 
     The solution of Wahba's problem; the specific force (..., 3) is upwards, and the weights are the
-    noise of each component relative to the length of the vector.
-
-    Raises
-    ------
-    InputError
-        Where the field is vertical: then both are parallel.
+    noise of each component relative to the length of the vector. Raises InputError where the field
+    is vertical: then both are parallel.
     """
     direction = field_world / np.linalg.norm(field_world)
     if np.hypot(direction[0], direction[1]) < LEAST_SHARE:
@@ -240,11 +217,7 @@ def match_with_gravity(
     """Return all three angles from the field and the specific force of a body at rest.
 
     A force (n, 3) (m/s^2) whose magnitude is not that of gravity leaves the attitude undetermined.
-
-    Raises
-    ------
-    InputError
-        As `attitude_with_gravity`.
+    Raises InputError as `attitude_with_gravity`.
     """
     shares = (sigma / float(np.linalg.norm(field_world)), force_sigma / gravity)
     turn = attitude_with_gravity(field_body, force_body, field_world, *shares)

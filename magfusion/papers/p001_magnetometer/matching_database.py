@@ -35,41 +35,22 @@ _OUTSIDE = 3.0  # spacings of the database
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """A database ready for queries.
-
-    Parameters
-    ----------
-    tree : KDTree
-        Over the compared components (T).
-    field_world : ndarray, shape (3,)
-        The uniform field that best fits the entries (T).
-    sigma : float
-        Its residual, per component (T).
-    spacing : float
-        Nearest-neighbour distance of an entry (T), 95th percentile.
-    side : int
-        Of the fold on which all entries lie.
-    """
+    """A database ready for queries."""
 
     database: AttitudeDatabase
-    tree: KDTree
-    field_world: Array
-    sigma: float
-    spacing: float
-    side: int
+    tree: KDTree  # over the compared components (T)
+    field_world: Array  # (3,), the uniform field that best fits the entries (T)
+    sigma: float  # its residual, per component (T)
+    spacing: float  # nearest-neighbour distance of an entry (T), 95th percentile
+    side: int  # of the fold on which all entries lie
 
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """A database, and the number of excluded measurements.
-
-    Parameters
-    ----------
-    beyond_fold : int
-        Measurements on the rarer side of the fold, where the same fields have other attitudes.
-    """
+    """A database, and the number of excluded measurements."""
 
     database: AttitudeDatabase
+    # measurements on the rarer side of the fold, where the same fields have other attitudes
     beyond_fold: int
 
 
@@ -123,10 +104,7 @@ def build_database(
 def prepare(database: AttitudeDatabase) -> Index:
     """Return a database ready for queries.
 
-    Raises
-    ------
-    InputError
-        Where a fixed angle varies, or the entries lie on both sides of the fold.
+    Raises InputError where a fixed angle varies, or the entries lie on both sides of the fold.
     """
     fixed = (1, 2) if database.angles == "roll" else (2,)
     for axis in fixed:

@@ -22,22 +22,11 @@ def closed_form(measured: Array, down_field: float, sigma: float | None = None) 
     In each group the four readings, added with the signs of the vertical axis, give one column of
     the matrix directly: ``K_a e_ba = (V_1 + V_2 - V_3 - V_4) / 4 B_D``.  The horizontal field and
     the heading cancel; only the magnitude of ``down_field`` and the level of the table matter.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (..., 12, 3)
-        One reading in each position, in the order of `SENSOR_FROM_NED` (T).
-    down_field : float
-        Downward component of the Earth's field (T).
-    sigma : float, optional
-        Of each component of a reading (T); by default from the three groups' offsets, which differ
-        by noise only.
-
-    Returns
-    -------
-    MagnetometerFit
-        The offset is the mean of all readings: each group's four positions cancel the field, and
-        three groups have less noise than the one that the paper uses for each axis.
+    `measured` (..., 12, 3): one reading in each position, in the order of `SENSOR_FROM_NED` (T).
+    `down_field`: downward component of the Earth's field (T). `sigma`: of each component of a
+    reading (T); by default from the three groups' offsets, which differ by noise only. The
+    offset is the mean of all readings: each group's four positions cancel the field, and three
+    groups have less noise than the one that the paper uses for each axis.
     """
     group = measured.reshape(*measured.shape[:-2], 3, 4, 3)
     readings = np.swapaxes(group, -1, -2)
@@ -58,14 +47,9 @@ def least_squares(
 ) -> MagnetometerFit:
     """Fit matrix and offset to readings of known fields.
 
-    Parameters
-    ----------
-    measured : ndarray, shape (..., n, 3)
-        (T)
-    field_sensor : ndarray, shape (n, 3)
-        True field (T), n at least 5; on a turntable ``positions(heading) @ field_ned``.
-    sigma : float, optional
-        Of each component of a reading (T); by default from the residuals.
+    `measured` (..., n, 3) (T). `field_sensor` (n, 3): true field (T), n at least 5; on a turntable
+    ``positions(heading) @ field_ned``. `sigma`: of each component of a reading (T); by default from
+    the residuals.
     """
     size = float(np.max(np.abs(field_sensor)))
     n = len(field_sensor)

@@ -46,42 +46,24 @@ TOO_FEW_POINTS = "too few fingerprints of the detected beacons"
 
 @dataclass(frozen=True, eq=False)
 class RotatingFields:
-    """Inputs of the published algorithms for each epoch.
+    """Inputs of the published algorithms for each epoch."""
 
-    Parameters
-    ----------
-    axis_world : ndarray, shape (beacons, 3)
-        Unit vectors about which the beacons' moments rotate by the right-hand rule.
-    amplitude : ndarray, shape (n, beacons)
-        Root mean square over time (T); NaN where a beacon was not detected.
-    normal_body : ndarray, shape (n, beacons, 3)
-        Normal of the plane in which the field rotates, of any length, body axes.
-    """
-
+    # (beacons, 3), unit vectors about which the beacons' moments rotate by the right-hand rule
     axis_world: Array
+    # (n, beacons), root mean square over time (T); NaN where a beacon was not detected
     amplitude: Array
+    # (n, beacons, 3), normal of the plane in which the field rotates, of any length, body axes
     normal_body: Array
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedFixes:
-    """Poses of the located epochs.
+    """Poses of the located epochs."""
 
-    Parameters
-    ----------
-    epoch : ndarray of int, shape (m,)
-        Their indices.
-    position_world : ndarray, shape (m, 3)
-        Of the sensor (m).
-    world_from_body : ndarray, shape (m, 3, 3)
-    dropped : mapping
-        Reason to number of epochs.
-    """
-
-    epoch: IntArray
-    position_world: Array
-    world_from_body: Array
-    dropped: Mapping[str, int]
+    epoch: IntArray  # (m,), their indices
+    position_world: Array  # (m, 3), of the sensor (m)
+    world_from_body: Array  # (m, 3, 3)
+    dropped: Mapping[str, int]  # reason to number of epochs
 
 
 def fix_as_published(
@@ -92,19 +74,9 @@ def fix_as_published(
 ) -> PublishedFixes:
     """Locate each epoch by one of the published algorithms, from the detected beacons.
 
-    Parameters
-    ----------
-    fields : RotatingFields
-        Of the database's beacons.
-    method : {"paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"}
-        Algorithm 1; 2, in logarithms or as printed in nT; 3.
-    block : float, optional
-        Size of the blocks of algorithm 1 (m); by default one line for all.
-
-    Raises
-    ------
-    EstimationError
-        Where a trilateration does not converge.
+    `fields`: of the database's beacons. `method`: algorithm 1; 2, in logarithms or as printed in
+    nT; 3. `block`: size of the blocks of algorithm 1 (m); by default one line for all. Raises
+    EstimationError where a trilateration does not converge.
     """
     detected = np.isfinite(fields.amplitude)
     enough = np.sum(detected, axis=1) >= LEAST_BEACONS

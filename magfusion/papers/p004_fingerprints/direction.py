@@ -17,17 +17,8 @@ def attitude_from_vectors(
 
     For phasors, which both must have the same drive phase, it is the maximum of the likelihood in
     white noise and exact at any attitude; two coils of a single beacon suffice.  For the directions
-    of paper 004, Eq 18-19, it is only the rotation nearest to a wrong equation.
-
-    Parameters
-    ----------
-    vector_sensor, vector_world : ndarray, real or complex, shape (..., vectors, 3)
-        Of any one unit.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        world_from_sensor.
+    of paper 004, Eq 18-19, it is only the rotation nearest to a wrong equation. `vector_sensor`,
+    `vector_world` (..., vectors, 3): of any one unit. Returns (..., 3, 3), world_from_sensor.
     """
     outer = vector_world[..., :, None] * np.conj(vector_sensor[..., None, :])
     return wahba(np.sum(outer.real, axis=-3))

@@ -223,12 +223,9 @@ eq_21_attitude = attitude_from_vectors
 def eq_21_attitude_as_printed(direction_sensor: Array, direction_world: Array) -> Array:
     """Return sensor_from_world (..., 3, 3) by least squares from directions (..., beacons, 3).
 
-    False: in general no rotation, and for three beacons it averages nothing.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Where the directions lie exactly in one plane; close to one the matrix means little.
+    False: in general no rotation, and for three beacons it averages nothing. Raises
+    numpy.linalg.LinAlgError where the directions lie exactly in one plane; close to one the matrix
+    means little.
     """
     seen, known = np.swapaxes(direction_sensor, -1, -2), np.swapaxes(direction_world, -1, -2)
     return seen @ direction_world @ np.linalg.inv(known @ direction_world)

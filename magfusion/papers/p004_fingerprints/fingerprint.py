@@ -27,22 +27,12 @@ NEIGHBOURS = 4  # n of paper 004, section 2.4
 
 @dataclass(frozen=True, eq=False)
 class FingerprintDatabase:
-    """Amplitudes of beacons at points with known positions.
-
-    Parameters
-    ----------
-    beacons : tuple of str
-    beacons_world : ndarray, shape (beacons, 3)
-        (m)
-    position_world : ndarray, shape (points, 3)
-        Of the sensor (m).
-    amplitude : ndarray, shape (points, beacons)
-        Root mean square over time (T); NaN where a beacon was not detected.
-    """
+    """Amplitudes of beacons at points with known positions."""
 
     beacons: tuple[str, ...]
-    beacons_world: Array
-    position_world: Array
+    beacons_world: Array  # (beacons, 3) (m)
+    position_world: Array  # (points, 3), of the sensor (m)
+    # (points, beacons), root mean square over time (T); NaN where a beacon was not detected
     amplitude: Array
 
     def __len__(self) -> int:
@@ -63,12 +53,8 @@ class FingerprintDatabase:
 def fingerprint_database(survey: Survey, site: Site) -> FingerprintDatabase:
     """Return the fingerprints of a survey, for the site's beacons in it.
 
-    The survey's poses are of the body; fingerprints belong to the sensor.
-
-    Raises
-    ------
-    InputError
-        Where the survey has a beacon or a tone that is not in the site.
+    The survey's poses are of the body; fingerprints belong to the sensor. Raises InputError where
+    the survey has a beacon or a tone that is not in the site.
     """
     unknown = [channel for channel in survey.channels if channel not in site.channels]
     if unknown:

@@ -25,7 +25,7 @@ def rotating_beacons(
     database: FingerprintDatabase, site: Site
 ) -> tuple[FingerprintDatabase, Array]:
     """Return the fingerprints of rotating beacons alone, and the axes about which these rotate."""
-    axis = np.array([rotation_axis_world(b) for b in _beacons(site, database)])
+    axis = np.array([rotation_axis_world(b) for b in site.beacons if b.name in database.beacons])
     columns = np.flatnonzero(np.isfinite(axis).all(axis=1))
     if len(columns) < LEAST_BEACONS:
         raise InputError(
@@ -39,21 +39,13 @@ def rotating_beacons(
         database.position_world,
         database.amplitude[:, columns],
     )
-    useful = int(np.sum(_enough(kept.amplitude)))
+    useful = int(np.sum(np.sum(np.isfinite(kept.amplitude), axis=1) >= LEAST_BEACONS))
     if useful < NEIGHBOURS:
         raise InputError(
             f"has {useful} points that detect {LEAST_BEACONS} rotating beacons; {NEIGHBOURS}"
             " are needed; survey more places"
         )
     return kept, axis[columns]
-
-
-def _beacons(site: Site, database: FingerprintDatabase) -> list[Beacon]:
-    return [b for b in site.beacons if b.name in database.beacons]
-
-
-def _enough(amplitude: Array) -> BoolArray:
-    return np.sum(np.isfinite(amplitude), axis=1) >= LEAST_BEACONS
 
 
 def rotation_axis_world(beacon: Beacon) -> Array:

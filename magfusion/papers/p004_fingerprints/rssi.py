@@ -28,18 +28,10 @@ _TINY = 1e-12  # m
 
 @dataclass(frozen=True, eq=False)
 class RssiLines:
-    """``ln(amplitude) = slope ln(distance) + intercept`` of each beacon (paper 004, Eq 16).
+    """``ln(amplitude) = slope ln(distance) + intercept`` of each beacon (paper 004, Eq 16)."""
 
-    Parameters
-    ----------
-    slope : ndarray, shape (..., beacons)
-        -3 for an ideal dipole.
-    intercept : ndarray, shape (..., beacons)
-        Natural logarithm of the amplitude (T) at one metre.
-    """
-
-    slope: Array
-    intercept: Array
+    slope: Array  # (..., beacons), -3 for an ideal dipole
+    intercept: Array  # (..., beacons), natural logarithm of the amplitude (T) at one metre
 
     def log_amplitude(self, distance: Array) -> Array:
         """Return the natural logarithm of the amplitude (T) at distances (..., beacons) (m)."""
@@ -48,24 +40,12 @@ class RssiLines:
 
 @dataclass(frozen=True, eq=False)
 class BlockLines:
-    """Lines of square blocks of the plan (paper 004, section 2.3 and figure 4).
+    """Lines of square blocks of the plan (paper 004, section 2.3 and figure 4)."""
 
-    Parameters
-    ----------
-    size : float
-        Edge of a block (m); the paper uses 2 m.
-    overall : RssiLines
-        Where there is no block, slope and intercept of shape (beacons,).
-    block : ndarray of int, shape (blocks, 2)
-        ``floor(position / size)`` in x and y.
-    lines : RssiLines
-        Of each block, shape (blocks, beacons).
-    """
-
-    size: float
-    overall: RssiLines
-    block: IntArray
-    lines: RssiLines
+    size: float  # edge of a block (m); the paper uses 2 m
+    overall: RssiLines  # where there is no block, slope and intercept of shape (beacons,)
+    block: IntArray  # (blocks, 2), ``floor(position / size)`` in x and y
+    lines: RssiLines  # of each block, shape (blocks, beacons)
 
     def at(self, position_world: Array) -> RssiLines:
         """Return the lines valid at positions (..., 3) (m), shape (..., beacons)."""
@@ -139,11 +119,7 @@ def trilaterate(ranges: Array, beacons_world: Array, start_world: Array) -> Arra
     Beacons in one plane give two mirror positions that fit equally well; the side of the start,
     (3,) or (..., 3) (m), decides between them.  Newton's method on all epochs at once, with the
     curvature made positive: Gauss-Newton converges slowly where the ranges are too short to meet.
-
-    Raises
-    ------
-    EstimationError
-        Where a range is not finite, or an iteration does not converge.
+    Raises EstimationError where a range is not finite, or an iteration does not converge.
     """
     if not np.all(np.isfinite(ranges)):
         raise EstimationError("trilateration requires the range to every beacon")

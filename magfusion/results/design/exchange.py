@@ -46,17 +46,10 @@ TRIES = 2000  # random layouts in a row that do not keep their distance
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidate beacons.
-
-    Parameters
-    ----------
-    beacons : tuple of Beacon
-    min_distance : float
-        Minimum distance of two beacons (m).
-    """
+    """Candidate beacons."""
 
     beacons: tuple[Beacon, ...]
-    min_distance: float
+    min_distance: float  # minimum distance of two beacons (m)
 
     @property
     def places(self) -> Array:
@@ -74,42 +67,23 @@ class Candidates:
 
 @dataclass(frozen=True)
 class ExchangeResult:
-    """A layout that no exchange improves.
+    """A layout that no exchange improves."""
 
-    Parameters
-    ----------
-    chosen : tuple of int
-        Indices of the candidates.
-    value : float
-        Of `layout_value`, at all points.
-    complete : bool
-        Whether the search ended before its time limit.
-    """
-
-    chosen: tuple[int, ...]
-    value: float
-    complete: bool
+    chosen: tuple[int, ...]  # indices of the candidates
+    value: float  # of `layout_value`, at all points
+    complete: bool  # whether the search ended before its time limit
 
 
 @dataclass(eq=False)
 class LayoutSearch:
-    """Candidates and the points at which they are compared, to which points can be added.
+    """Candidates and the points at which they are compared, to which points can be added."""
 
-    Parameters
-    ----------
-    information : LayoutInformation
-        At all points.
-    objective : {'worst', 'sigma', 'D', 'A'}
-        Worst protection level (m); worst position sigma (m); mean of the logarithm of the
-        determinant of the position's covariance; mean of its trace (m^2).
-    in_time : callable
-        Whether the time limit is not reached.
-    """
-
-    information: LayoutInformation
+    information: LayoutInformation  # at all points
     candidates: Candidates
+    # worst protection level (m); worst position sigma (m); mean of the logarithm of the determinant
+    # of the position's covariance; mean of its trace (m^2)
     objective: Objective
-    in_time: Callable[[], bool] = lambda: True
+    in_time: Callable[[], bool] = lambda: True  # whether the time limit is not reached
     active: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     roots: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     standing: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))

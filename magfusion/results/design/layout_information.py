@@ -39,27 +39,13 @@ FLOOR = 1e-14  # of each number's own information: keeps what is open finite, an
 
 @dataclass(frozen=True, eq=False)
 class LayoutInformation:
-    """Information of beacons at places on the pose at points.
+    """Information of beacons at places on the pose at points."""
 
-    Parameters
-    ----------
-    site : Site
-        With the beacons that stay.
-    template : Beacon
-        Beacon of which copies are added.
-    points : ndarray, shape (n, 3)
-        Positions of the platform (m), level and along the world's axes.
-    window : float
-        Averaging time of the tones (s).
-    risk : Risk
-        Specification of the protection levels.
-    """
-
-    site: Site
-    template: Beacon
-    points: Array
-    window: float
-    risk: Risk
+    site: Site  # with the beacons that stay
+    template: Beacon  # beacon of which copies are added
+    points: Array  # (n, 3), positions of the platform (m), level and along the world's axes
+    window: float  # averaging time of the tones (s)
+    risk: Risk  # specification of the protection levels
 
     def at(self, points: Array) -> "LayoutInformation":
         """Return the same at other points."""

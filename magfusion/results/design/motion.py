@@ -47,26 +47,13 @@ AT_ONCE = 200
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """The parameters to calibrate.
+    """The parameters to calibrate."""
 
-    Parameters
-    ----------
-    names : list of (str, str, float)
-        In words, with unit and the unit's size.
-    sigma : ndarray, shape (k,)
-        Declared by the site, as tangent vector.
-    weight : ndarray, shape (k,)
-        Change of the fields for one sigma, in sigmas of their noise.
-    limit : ndarray, shape (k,)
-        Relative to the declared sigma, after all possible stops.
-    requested : bool ndarray, shape (k,)
-        Whether stops can determine it, and it belongs to the site rather than to one log.
-    """
-
-    names: list[tuple[str, str, float]]
-    sigma: Array
-    weight: Array
-    limit: Array
+    names: list[tuple[str, str, float]]  # in words, with unit and the unit's size
+    sigma: Array  # (k,), declared by the site, as tangent vector
+    weight: Array  # (k,), change of the fields for one sigma, in sigmas of their noise
+    limit: Array  # (k,), relative to the declared sigma, after all possible stops
+    # (k,), whether stops can determine it, and it belongs to the site rather than to one log
     requested: BoolArray
 
     def worst(self, ratio: Array) -> int:
@@ -89,19 +76,12 @@ class Parameters:
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A pose to keep, and its effect.
-
-    Parameters
-    ----------
-    worst : int
-        The parameter for which it is selected.
-    before, after : float
-        Its sigma, relative to the declared one.
-    """
+    """A pose to keep, and its effect."""
 
     position_world: Array
     rpy_deg: tuple[float, float, float]
-    worst: int
+    worst: int  # the parameter for which it is selected
+    # before, after: its sigma, relative to the declared one
     before: float
     after: float
 
@@ -120,34 +100,19 @@ class MotionPlan:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Candidate stops, and their information.
+    """Candidate stops, and their information."""
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        (m)
-    attitude : int ndarray, shape (n,)
-        Index of `ATTITUDES_DEG`.
-    root : ndarray, shape (n, rows, k)
-        Of the information on the calibration, in units of the declared sigmas.
-    """
-
-    position_world: Array
-    attitude: IntArray
+    position_world: Array  # (n, 3) (m)
+    attitude: IntArray  # (n,), index of `ATTITUDES_DEG`
+    # (n, rows, k), of the information on the calibration, in units of the declared sigmas
     root: Array
 
 
 def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bool) -> MotionPlan:
     """Select stops one after another, each for the parameter that is then the worst.
 
-    Parameters
-    ----------
-    places : ndarray, shape (m, 3)
-        Possible positions of the platform (m); thinned evenly if many.
-    stop : float
-        Duration (s).
-    known : bool
-        Whether the poses are measured, as those of a survey.
+    `places` (m, 3): possible positions of the platform (m); thinned evenly if many. `stop`:
+    duration (s). `known`: whether the poses are measured, as those of a survey.
     """
     blocks = choose_blocks(site, SURVEY_GROUPS)
     poses = candidate_poses(site, blocks, places, stop, known=known)

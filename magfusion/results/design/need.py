@@ -55,14 +55,8 @@ def min_beacons(
 ) -> NeededDesign:
     """Find the fewest beacons that reach an accuracy, by bisection.
 
-    Parameters
-    ----------
-    need : float
-        Largest protection level or position sigma (m).
-    max_count : int
-        Largest number.
-    design : callable
-        `designed` of a task.
+    `need`: largest protection level or position sigma (m). `max_count`: largest number. `design`:
+    `designed` of a task.
     """
     low, high = FIRST - 1, FIRST
     best = _tried(task, need, high, design)

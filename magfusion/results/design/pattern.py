@@ -16,22 +16,14 @@ NO_MOMENT = 0.1  # of the largest; a direction with less has none
 
 @dataclass(frozen=True, eq=False)
 class ToneBand:
-    """Frequency band of tones, and their spacing.
+    """Frequency band of tones, and their spacing."""
 
-    Parameters
-    ----------
-    low, high : float
-        (Hz)
-    window : float
-        Time over which tones must be separated (s): any two are two of its periods apart.
-    mains_hz : float
-        Mains frequency whose harmonics are avoided; 0 for none.
-    """
-
+    # low, high (Hz)
     low: float
     high: float
+    # time over which tones must be separated (s): any two are two of its periods apart
     window: float
-    mains_hz: float
+    mains_hz: float  # mains frequency whose harmonics are avoided; 0 for none
 
     @property
     def spacing(self) -> float:

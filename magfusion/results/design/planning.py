@@ -40,70 +40,36 @@ MOST_CANDIDATES = 6000
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A design task.
+    """A design task."""
 
-    Parameters
-    ----------
-    site : Site
-        With the beacons that stay.
-    template : Beacon
-        Beacon of which copies are placed, with the moment of each.
-    count : int
-        Of the copies.
-    places : ndarray, shape (m, 3)
-        Possible mounting places (m).
-    points : ndarray, shape (n, 3)
-        Points of use (m).
-    axes : int
-        Number of candidate directions of each.
-    min_distance, clearance : float
-        Minimum distance of two beacons, and of a beacon from points of use (m).
-    budgeted : bool
-        Whether the moments may be distributed unevenly.
-    """
-
-    site: Site
-    template: Beacon
-    count: int
-    places: Array
-    points: Array
+    site: Site  # with the beacons that stay
+    template: Beacon  # beacon of which copies are placed, with the moment of each
+    count: int  # of the copies
+    places: Array  # (m, 3), possible mounting places (m)
+    points: Array  # (n, 3), points of use (m)
     band: ToneBand
     risk: Risk
     objective: Objective = "worst"
-    axes: int = 7
+    axes: int = 7  # number of candidate directions of each
+    # min_distance, clearance: minimum distance of two beacons, and of a beacon from points of use
+    # (m)
     min_distance: float = 1.0
     clearance: float = 0.5
-    budgeted: bool = False
+    budgeted: bool = False  # whether the moments may be distributed unevenly
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A finished design.
+    """A finished design."""
 
-    Parameters
-    ----------
-    site : Site
-        With the beacons that stayed and the new ones.
-    new : tuple of Beacon
-    candidates : int
-        Number of candidates.
-    complete : bool
-        Whether the search ended before its time limit.
-    random_worst_m : ndarray, shape (layouts,)
-        Worst protection level of random layouts of the same candidates (m).
-    median_random : Site, optional
-        The random layout whose worst level is the median.
-    best_random : Site, optional
-        The random layout that is best by the task's objective.
-    """
-
-    site: Site
+    site: Site  # with the beacons that stayed and the new ones
     new: tuple[Beacon, ...]
-    candidates: int
-    complete: bool
+    candidates: int  # number of candidates
+    complete: bool  # whether the search ended before its time limit
+    # (layouts,), worst protection level of random layouts of the same candidates (m)
     random_worst_m: Array
-    median_random: Site | None
-    best_random: Site | None
+    median_random: Site | None  # the random layout whose worst level is the median
+    best_random: Site | None  # the random layout that is best by the task's objective
 
 
 def designed(
@@ -118,16 +84,9 @@ def designed(
 ) -> Design:
     """Select places, axes, moments and frequencies.
 
-    Raises InputError where there are no mounting places, or too few at this distance.
-
-    Parameters
-    ----------
-    starts : int
-        Of the search.
-    layouts : int
-        Number of random ones to compare with.
-    first : Site, optional
-        Site whose beacons, of the same number, are the first start.
+    Raises InputError where there are no mounting places, or too few at this distance. `starts`: of
+    the search. `layouts`: number of random ones to compare with. `first`: site whose beacons, of
+    the same number, are the first start.
     """
     tones, allowed = np.zeros((0, 0)), np.zeros(0)
     if is_in_turn(task.template):

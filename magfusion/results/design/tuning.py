@@ -23,14 +23,8 @@ def divided(
 ) -> tuple[tuple[Beacon, ...], Array]:
     """Move moment from one beacon to another as long as the objective improves.
 
-    `beacons`: each with an equal share.
-
-    Returns
-    -------
-    beacons : tuple of Beacon
-        With the same sum of moments.
-    share : ndarray, shape (beacons,)
-        Relative to the initial moments.
+    `beacons`: each with an equal share. Returns `beacons`: with the same sum of moments;
+    `share` (beacons,): relative to the initial moments.
     """
     share = np.ones(len(beacons))
 

@@ -15,23 +15,13 @@ _VIEWS = ((0, 1), (0, 2))  # plan and elevation
 
 @dataclass(frozen=True, eq=False)
 class BeaconPanel:
-    """One beacon of the picture.
-
-    Parameters
-    ----------
-    centre_cov : ndarray, shape (3, 3)
-        Of the estimated centre, world axes (m^2).
-    point : ndarray, shape (n,)
-        Index of each point of the survey.
-    residual : ndarray, shape (n,)
-        Whitened, root of the mean square at each point.
-    """
+    """One beacon of the picture."""
 
     declared: Beacon
     estimated: Beacon
-    centre_cov: Array
-    point: Array
-    residual: Array
+    centre_cov: Array  # (3, 3), of the estimated centre, world axes (m^2)
+    point: Array  # (n,), index of each point of the survey
+    residual: Array  # (n,), whitened, root of the mean square at each point
 
 
 def write_beacon_plot(path: Path, panels: list[BeaconPanel]) -> None:

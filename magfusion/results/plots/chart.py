@@ -45,17 +45,7 @@ class ChartMark(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Content of a chart.
-
-    Parameters
-    ----------
-    equal : bool
-        Whether both axes have one scale, as in a plan.
-    log : bool
-        Whether the upright axis is logarithmic.
-    y_limits : (float, float), optional
-        Limits of the upright axis; values beyond are drawn at the edge.
-    """
+    """Content of a chart."""
 
     title: str
     x_label: str
@@ -63,8 +53,9 @@ class Chart:
     lines: tuple[ChartLine, ...]
     bands: tuple[ChartBand, ...] = ()
     marks: tuple[ChartMark, ...] = ()
-    equal: bool = False
-    log: bool = False
+    equal: bool = False  # whether both axes have one scale, as in a plan
+    log: bool = False  # whether the upright axis is logarithmic
+    # limits of the upright axis; values beyond are drawn at the edge
     y_limits: tuple[float, float] | None = None
     width: float = 440.0
     height: float = 230.0

@@ -21,14 +21,8 @@ def write_log_calibration_plot(
 ) -> None:
     """Write a PNG: the ratio of posterior to prior sigma of each parameter and each direction.
 
-    Parameters
-    ----------
-    estimates : list of ParameterEstimate
-        Every parameter.
-    ratio_but_for_gauge : ndarray, shape (parameters,)
-        The same without gauges; NaN where nothing remains.
-    direction_ratio : ndarray, shape (parameters,)
-        Ascending.
+    `estimates`: every parameter. `ratio_but_for_gauge` (parameters,): the same without gauges; NaN
+    where nothing remains. `direction_ratio` (parameters,): ascending.
     """
     height = min(1.5 + 0.22 * len(estimates), HIGHEST)
     figure = Figure(figsize=(12.0, height), layout="constrained")

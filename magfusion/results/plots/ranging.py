@@ -15,22 +15,13 @@ _TURN: Array = np.linspace(0.0, 2.0 * np.pi, 90)
 
 
 class RangePicture(NamedTuple):
-    """Position of the magnet in each window (n,), relative to the sensor.
+    """Position of the magnet in each window (n,), relative to the sensor."""
 
-    Parameters
-    ----------
-    magnet_depth, sensor_depth : ndarray, shape (n,)
-        Measured (m).
-    place : ndarray, shape (n, 3)
-        Ahead, to the right, and up to the high side (m).
-    cov : ndarray, shape (n, 3, 3)
-        (m^2)
-    """
-
+    # magnet_depth, sensor_depth: (n,), measured (m)
     magnet_depth: Array
     sensor_depth: Array
-    place: Array
-    cov: Array
+    place: Array  # (n, 3), ahead, to the right, and up to the high side (m)
+    cov: Array  # (n, 3, 3) (m^2)
 
 
 def write_range_plot(path: Path, reported: RangePicture, *, high_side: bool) -> None:

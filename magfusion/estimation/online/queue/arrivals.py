@@ -47,37 +47,18 @@ class Arrivals(ABC):
     """Streams of a platform, sorted by time, each on its own clock.
 
     What depends on how many magnetometers there are is left to its two kinds.
-
-    Attributes
-    ----------
-    imu : InertialStream
-        Of the motion prior, where the platform has none.
-    streams : list of SensorStream
-        Raw samples of each magnetometer; empty where fields are given.
-    fields : list of FieldSamples
-        One epoch each, the oldest first.
-    steady : dict
-        By the time of the epoch (s), its static fields.
-    others : OtherMeasurements
-    last_epoch : float
-        Time of the last fields (s).
-    short : ShortWindows, optional
-        Of tones that are close, where one magnetometer measures them together.
-    open_signs : int
-        Amplitudes that are dropped because their sign is undetermined.
-    without : Counter
-        Number of epochs without each magnetometer, while it was silent.
     """
 
-    imu: InertialStream
-    streams: list[SensorStream]
-    fields: list[FieldSamples]
-    steady: dict[float, SteadyFields]
+    imu: InertialStream  # of the motion prior, where the platform has none
+    streams: list[SensorStream]  # raw samples of each magnetometer; empty where fields are given
+    fields: list[FieldSamples]  # one epoch each, the oldest first
+    steady: dict[float, SteadyFields]  # by the time of the epoch (s), its static fields
     others: OtherMeasurements
-    last_epoch: float
+    last_epoch: float  # time of the last fields (s)
+    # of tones that are close, where one magnetometer measures them together
     short: ShortWindows | None
-    open_signs: int
-    without: Counter[str]
+    open_signs: int  # amplitudes that are dropped because their sign is undetermined
+    without: Counter[str]  # number of epochs without each magnetometer, while it was silent
     _detection: DetectionFilter
     _still: StillSamples
     _last_sample_times: dict[str, float]  # of each of several magnetometers (s)

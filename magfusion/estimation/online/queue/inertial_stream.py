@@ -15,30 +15,13 @@ OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 
 
 class InertialStream:
-    """The inertial samples of a platform, each by its own stamp.
+    """The inertial samples of a platform, each by its own stamp."""
 
-    Parameters
-    ----------
-    offset : float
-        Added to the stamps for the log's clock (s).
-
-    Attributes
-    ----------
-    buffer : Buffer
-        Rates and specific forces of the body.
-    filler : ImuGapFiller
-        Substitutes for missing samples.
-    usual : float, optional
-        Sampling interval (s), once there is a state.
-    frozen : int
-        Samples that are dropped because a sensor is frozen.
-    """
-
-    buffer: Buffer
-    filler: ImuGapFiller
-    offset: float
-    usual: float | None
-    frozen: int
+    buffer: Buffer  # rates and specific forces of the body
+    filler: ImuGapFiller  # substitutes for missing samples
+    offset: float  # added to the stamps for the log's clock (s)
+    usual: float | None  # sampling interval (s), once there is a state
+    frozen: int  # samples that are dropped because a sensor is frozen
     _gyro: Freeze
     _accel: Freeze
 

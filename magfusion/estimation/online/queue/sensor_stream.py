@@ -22,33 +22,17 @@ BEGINNING = 0.5  # s; of samples, to start a receiver that had none at the first
 class SensorStream:
     """One magnetometer's samples on the log's clock, its receiver, and its pending windows.
 
-    Parameters
-    ----------
-    receiver : Receiver
-        Of this magnetometer only, on the log's clock.  It begins with the first state, and never
-        where phasors are given.
-    name : str
-        Of the samples, for error messages.
-
-    Attributes
-    ----------
-    samples : Buffer
-    windows : deque of int
-        Numbers of windows that are admitted and not demodulated yet.
-    now : int, optional
-        Of the window at the state that is to be predicted.
-    late : int
-        Windows that arrived after the others were processed.
-    unseen : int
-        Windows without inertial samples.
+    `name`: of the samples, for error messages.
     """
 
+    # of this magnetometer only, on the log's clock. It begins with the first state, and never where
+    # phasors are given
     receiver: Receiver
     samples: Buffer
-    windows: deque[int]
-    now: int | None
-    late: int
-    unseen: int
+    windows: deque[int]  # numbers of windows that are admitted and not demodulated yet
+    now: int | None  # of the window at the state that is to be predicted
+    late: int  # windows that arrived after the others were processed
+    unseen: int  # windows without inertial samples
     _noise: list[Array]
     _noise_unseen: bool
 
