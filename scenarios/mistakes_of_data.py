@@ -205,12 +205,17 @@ MISTAKES = (
     Mistake("magnetometer_saturated", "data", _wave(_saturated), ("saturated",)),
     Mistake("magnetometer_held_2", "data", _wave(_repeated_samples(2)), ("repeated_samples",)),
     Mistake("samples_lost_5pct", "data", of_waveform(_is_lost), harmless=True),
-    Mistake("body_iron", "data", _wave(_body_iron), ("magnetometer_matrix", "magnetometer_offset")),
+    Mistake(
+        "body_iron",
+        "data",
+        _wave(_body_iron),
+        ("magnetometer_matrix", "magnetometer_offset", "body_iron"),
+    ),
     Mistake(
         "magnet_on_body",
         "data",
         _wave(lambda m: m + np.array([2e-5, 0.0, -1e-5])),
-        ("magnetometer_matrix", "magnetometer_offset"),
+        ("magnetometer_matrix", "magnetometer_offset", "body_iron"),
         harmless=True,
     ),
 )

@@ -175,7 +175,7 @@ _LINE = ("undeclared_line", "fitted_line", "mains", "beacon_fault", "field_resid
 _RANGE = ("saturated", "imu_spikes")
 _UNITS = ("field_units",)
 _SENSOR = ("magnetometer_axes", "mounting")
-_FILTER = ("phase", "response", "epoch_shift", "moments", "moment_units")
+_FILTER = ("low_pass", "phase", "response", "epoch_shift", "moments", "moment_units")
 _FRAME = ("earth_field", "survey_axes", "gravity_sign", "imu_axes")
 
 MISTAKES = (
@@ -228,7 +228,7 @@ MISTAKES = (
         "survey_tilted_5deg",
         "instrument",
         _survey((4, -3, 0), (0, 0, 0)),
-        ("gravity_direction", "beacon_pose"),
+        ("survey_tilt", "gravity_direction", "beacon_pose"),
     ),
     Mistake("survey_ned", "instrument", _ned, _FRAME),
     Mistake("names_swapped", "instrument", _names_swapped, harmless=True),

@@ -15,7 +15,8 @@ _AboveZero = Annotated[float, Field(gt=0.0)]
 _FromZero = Annotated[float, Field(ge=0.0)]
 _Positive = Annotated[_AboveZero, between(1e-12, 1e6)]
 _NotNegative = Annotated[_FromZero, between(0.0, 1e6)]
-_Matrix = Annotated[Array, array(3, 3, largest=10.0), AfterValidator(not_singular)]
+# Beyond scale and alignment, it may undo a wrong unit: degrees, g, or thousandths of it.
+_Matrix = Annotated[Array, array(3, 3, largest=1e4), AfterValidator(not_singular)]
 _MOTION, _PRIOR = MotionModel(), MotionPrior()
 MILLION = 1e6  # ppm in one
 

@@ -41,6 +41,7 @@ SAMPLE_TESTS: tuple[SampleTest, ...] = (
     noisy_inertial,
 )
 LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
+MOUNTED = 0.1  # rad; largest sigma of a mounting that is known
 # Of gyroscope and clocks: where they are wrong, the gyro-stabilized axes are wrong too.
 UNSTEADY = frozenset(
     {"gyro_sign", "gyro_units", "gyro_scale", "imu_axes", "imu_clock", "stuck_axis"}
@@ -87,12 +88,14 @@ def recorded(
     """
     result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
     log = beginning(log)
-    result += turned_otherwise(log, site) if log.inertial else []
+    # Of an unknown mounting the field and the gyroscope cannot be compared.
+    mounted = site is None or np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED
+    result += turned_otherwise(log, site) if log.inertial and mounted else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in result):
         result += gravity_and_field_findings(log, site, poses, estimated)
         if not any(finding.code in OF_GRAVITY for finding in result):
             result += truth_findings(log)
-        if site is not None and log.vectors is not None:
+        if site is not None and mounted and log.vectors is not None:
             result += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
         result += _of_beacons(log, site, detection, lockin, compensated)
