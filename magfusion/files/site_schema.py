@@ -72,7 +72,7 @@ class WorldSigmaEntry(StrictModel):
 class WorldEntry(StrictModel):
     """Gravity, the Earth's field and the trust in the field model."""
 
-    gravity_m_s2: Annotated[AboveZero, between(0.1, 100.0)] = 9.80665
+    gravity_m_s2: Annotated[AboveZero, between(1e-3, 100.0)] = 9.80665
     model_error: Share = 0.005
     model_error_correlation_m: NotNegative = Site.model_error_length
     field_map: Annotated[str, Field(min_length=1)] | None = None

@@ -27,6 +27,7 @@ from magfusion.units import Array
 
 PER_CENT = 0.01
 EYE, NOTHING = np.eye(3), np.zeros((3, 3))
+NO_GRAVITY = 1e-3  # m/s^2, that a site declares where gravity was removed from the data
 
 
 def with_intrinsics(
@@ -54,6 +55,11 @@ def with_imu(site: Site, **changed: float) -> Site:
     return replace(site, platform=replace(site.platform, imu=imu))
 
 
+def with_gravity(site: Site, gravity: float) -> Site:
+    """Return a site with another gravity (m/s^2)."""
+    return replace(site, gravity=max(gravity, NO_GRAVITY))
+
+
 # Those of the inertial sensors, which no estimated parameter describes.
 _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
     # The states estimate them: their sigmas are too small.
@@ -65,7 +71,7 @@ _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
         site, Rotation.from_rotvec(step).as_matrix()
     ),
     GYRO_G_SENSITIVITY: lambda site, step: with_intrinsics(site, g_sensitivity=step.reshape(3, 3)),
-    GRAVITY: lambda site, step: replace(site, gravity=site.gravity + float(step[0])),
+    GRAVITY: lambda site, step: with_gravity(site, site.gravity + float(step[0])),
 }
 
 

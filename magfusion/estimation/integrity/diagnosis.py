@@ -15,6 +15,7 @@ from magfusion.estimation.data_checks.magnetometers import first_magnetometer
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.likely_cause import OF_MOTION, cause_of
 from magfusion.estimation.integrity.steel_test import STEEL
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -82,11 +83,13 @@ def diagnosed(
     """Return the cause of what the witnesses say, where one explains the log.
 
     `trust`: what they say; where it is trustworthy, nothing is tried, and only what is clear
-    outweighs steel. `settings`: of the estimator.
+    outweighs steel. Of what the streams show themselves only the correction is sought. `settings`:
+    of the estimator.
     """
     if trust.verdict is Verdict.TRUSTWORTHY:
         return None
-    if seen_in_streams(trust):
+    shown = shown_by_compasses(trust)
+    if seen_in_streams(trust) and not shown:
         return None
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
         return None
@@ -103,30 +106,42 @@ def diagnosed(
     if said is None:
         return None
     one, text = said
-    known = _diagnosis(one, text, trust.verdict, several)
+    if shown and one.code not in shown:
+        return None
+    known = _diagnosis(one, text, trust.verdict, site, several=several)
     if not known.is_clear and is_steel:
         return None
     if one.rival is None:
         return known
-    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), trust.verdict, several)
+    rival = _diagnosis(
+        one.rival, one.rival.text(OF_MOTION), trust.verdict, site, several=several
+    )
     return known._replace(rival=rival, rival_probability=one.rival_probability)
 
 
-def _diagnosis(one: Explanation, text: str, verdict: Verdict, several: bool) -> Diagnosis:
+def _diagnosis(
+    one: Explanation, text: str, verdict: Verdict, declared: Site, *, several: bool
+) -> Diagnosis:
     """Return an explanation as a finding; what several magnetometers share is not undone."""
     weight = OF_CATCH_ALL if one.catch_all else CAUSE_FIRST
-    finding = Finding(one.code, text, verdict, weight)
+    undone = None if several else one.site
+    remedy = None if undone is None else changed_keys(declared, undone)
+    finding = Finding(one.code, text, verdict, weight, remedy=remedy or None)
     ratio = one.before / max(one.after, 1e-9)
-    return Diagnosis(finding, None if several else one.site, ratio, one.found > 0)
+    return Diagnosis(finding, undone, ratio, one.found > 0)
 
 
 def seen_in_streams(trust: Trust) -> bool:
     """Return whether the raw streams show a cause themselves, so that no other is looked for."""
-    return any(
-        (f.code in OF_SAMPLES and f.verdict is not Verdict.TRUSTWORTHY)
-        or (f.code in OF_COMPASSES and f.verdict is Verdict.FAILED)
-        for f in trust.findings
+    return bool(shown_by_compasses(trust)) or any(
+        f.code in OF_SAMPLES and f.verdict is not Verdict.TRUSTWORTHY for f in trust.findings
     )
+
+
+def shown_by_compasses(trust: Trust) -> set[str]:
+    """Return the codes by which gravity, field and gyroscope fail a log."""
+    failed = (f.code for f in trust.findings if f.verdict is Verdict.FAILED)
+    return OF_COMPASSES.intersection(failed)
 
 
 def _is_wrong_throughout(trust: Trust) -> bool:

@@ -1,7 +1,7 @@
 """What would explain a log that contradicts its declaration, and how well."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy.special import expit
 
@@ -15,6 +15,7 @@ ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
 LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise
 ALIKE = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
+EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,18 @@ def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
     """Return the explanation that is better than those of any other code, if there is one.
 
     What leaves out all that is wrong has the smallest chi square there can be: a mistake that
-    explains as much, and says what it is, is the better explanation.
+    explains as much, and says what it is, is the better explanation.  Of one code, the first of
+    those that explain equally much is the most common.
     """
-    ranked = sorted(tried, key=lambda one: one.score)
+    every = list(tried)
+    ranked = sorted(every, key=lambda one: one.score)
     if not ranked:
         return None
-    best = ranked[0]
+    least = ranked[0]
+    equal = (one for one in every if one.code == least.code and one.score < least.score + EQUAL)
+    best = next(equal)
+    if best is not least and best.rival is None:
+        best = replace(best, rival=least)
     if best.catch_all:
         named = (one for one in ranked if not one.catch_all and one.clear and one.as_well_as(best))
         best = next(named, best)

@@ -96,7 +96,7 @@ def causes_of(
             release_fault(pose_cov, score, fault, information, gradient)
             for fault in candidates(information, gradient)
         )
-        every = [one for one in released if one is not None]
+        every = [one for one in released if one is not None and one.is_possible]
         largest = max((one.gain for one in every), default=0.0)
         if largest < max(LEAST_EVIDENCE, LEAST_SHARE * first):
             return
@@ -169,6 +169,9 @@ def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault]
         tilt = -np.rad2deg(TYPICAL_TILT * size)  # the step takes it back
         result = f"it is tilted by {tilt[0]:+.2g} deg about x and {tilt[1]:+.2g} deg about y"
         remedy = "Rotate positions and attitudes of all beacons back: world z is the plumb line"
+    elif cause.code == "gravity_missing":
+        result = f"{error_in_words(site, cause)}, as where it was removed from the specific force"
+        remedy = "Record the specific force as the sensor measures it: +g on z at rest, level"
     else:
         result = error_in_words(site, cause)
         remedy = "Correct it by this amount, or declare a sigma of this size to estimate it"

@@ -8,12 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.corrected_site import (
+    with_gravity,
     with_imu,
     with_intrinsics,
     with_magnetometer,
 )
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
+from magfusion.estimation.integrity.suspects import ACCEL_BIAS, GYRO_BIAS, LARGEST
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
 from magfusion.model.samples import ImuSamples
@@ -36,7 +38,6 @@ ACCEL_UNITS = {
 LATEST = 3.0  # s
 PARTS = 4  # of a log, in each of which a delay is sought
 UNUSUAL = 3.0  # sigmas of a declared time offset
-LARGEST_BIAS = {"gyro": 0.5, "accel": 1.5}  # rad/s, m/s^2; what is larger is no bias
 EYE = np.eye(3)
 OF_AXES = "Check the order and the signs of the IMU's axes, and body_from_sensor."
 
@@ -55,7 +56,7 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
     ) -> Explanation:
         after, _ = known.explained(gyro_axes, accel_axes, gravity=gravity)
         inverse = [np.asarray(np.linalg.inv(axes), dtype=float) for axes in (gyro_axes, accel_axes)]
-        undone = with_intrinsics(site, *inverse) if gravity else None
+        undone = with_intrinsics(site, *inverse) if gravity else with_gravity(site, 0.0)
         return Explanation(code, cause, remedy, before, after, known.freedom, site=undone)
 
     yield from _turned(known, before, site)
@@ -144,9 +145,9 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
             site, body_from_sensor=axes.T @ site.platform.magnetometer.body_from_sensor
         ),
     )
-    for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
+    for sensor, unit, bias in (("gyro", "rad/s", GYRO_BIAS), ("accel", "m/s^2", ACCEL_BIAS)):
         after, found = known.explained(EYE, EYE, parameters=sensor)
-        if np.max(np.abs(found[SHARED[sensor]])) > LARGEST_BIAS[sensor]:
+        if np.max(np.abs(found[SHARED[sensor]])) > LARGEST[bias]:
             continue
         yield Explanation(
             "imu_bias",

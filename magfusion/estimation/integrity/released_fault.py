@@ -6,12 +6,13 @@ import numpy as np
 
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import USUAL, Inertial, Suspect
+from magfusion.estimation.integrity.suspects import GRAVITY, LARGEST, USUAL, Inertial, Suspect
 from magfusion.model.parameters import AidingParameter
 from magfusion.units import Array
 
 FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
 COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
+MISSING = 5.0  # m/s^2 less than declared: gravity was removed from the data
 PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the price of a parameter
 
 
@@ -45,7 +46,18 @@ class ReleaseGain:
     @property
     def code(self) -> str:
         """Code of its finding."""
+        (block, *_) = self.fault.blocks
+        if block.parameter is GRAVITY and float(block.sigma @ self.step[block.columns]) < -MISSING:
+            return "gravity_missing"
         return self.fault.finding_code
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether no parameter is moved by more than it may be."""
+        return all(
+            float(np.max(np.abs(b.sigma * self.step[b.columns]))) < LARGEST.get(b.parameter, np.inf)
+            for b in self.fault.blocks
+        )
 
     @property
     def log_p(self) -> float:

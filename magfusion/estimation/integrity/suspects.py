@@ -219,6 +219,9 @@ USUAL: dict[Parameter, float] = TOLERANCE | {
     AIDING_CLOCK: 0.02,
 }
 
+# What is larger is another mistake: a unit, an axis, gravity.
+LARGEST: dict[Parameter, float] = {GYRO_BIAS: 0.5, ACCEL_BIAS: 1.5}
+
 # Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
 CODE: dict[Parameter, str] = {
     BEACON_ROTATION: "beacon_pose",
