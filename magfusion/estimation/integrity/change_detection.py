@@ -24,7 +24,16 @@ from magfusion.estimation.integrity.released_fault import (
     release_gain,
 )
 from magfusion.estimation.integrity.score import answered, scores_of
-from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
+from magfusion.estimation.integrity.suspects import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    Bias,
+    Inertial,
+    Stream,
+    Suspect,
+    spoken_name,
+    suspects,
+)
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
     BEACON_POSITION,
@@ -87,25 +96,6 @@ class Stamps(Parameter):
         return (-1j * view.phasor * turns[:, None])[..., None]
 
 
-class Bias(Inertial):
-    """Constant bias of the accelerometer or the gyro, in addition to the random walk."""
-
-    def __init__(self, first: int) -> None:
-        self.first = first
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Bias) and self.first == other.first
-
-    def __hash__(self) -> int:
-        return hash((Bias, self.first))
-
-    def as_bias(self, stream: Stream) -> Array:
-        """Return ones in its own rows."""
-        rows = np.zeros((6, 3))
-        rows[self.first : self.first + 3] = np.eye(3)
-        return np.broadcast_to(rows, (len(stream.imu), 6, 3))
-
-
 class SinceBias(Inertial):
     """Step of a bias at some time (s)."""
 
@@ -126,7 +116,6 @@ class SinceBias(Inertial):
 
 
 STAMPS = Stamps()
-ACCEL_BIAS, GYRO_BIAS = Bias(0), Bias(3)
 # Tested parameters: size in a unit of the tangent vector, and words.
 TYPICAL: dict[Parameter, float] = {
     GAIN: 0.01,
@@ -195,7 +184,7 @@ def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestR
     `result`: with the fields of the beacon after that.
     """
     kinds = (GAIN, BEACON_POSITION, BEACON_ROTATION)
-    steps = [_step(kind, name, onset) for kind in kinds]
+    steps = [step_of(kind, name, onset) for kind in kinds]
     imu = logged(log, result.declared.site)[0].imu
     scores, pose_cov = scores_of(result, imu, steps), result.states.pose_cov
     if scores is None or pose_cov is None:
@@ -254,10 +243,11 @@ def _blocks(site: Site, at: float) -> list[Block]:
     every += [(BEACON_ROTATION, owner) for owner in owners]
     if site.platform.inertial:
         every += [(kind, "imu") for kind in (TIME_OFFSET, ACCEL_BIAS, GYRO_BIAS)]
-    return [_step(kind, owner, at) for kind, owner in every]
+    return [step_of(kind, owner, at) for kind, owner in every]
 
 
-def _step(kind: Parameter, owner: str, at: float) -> Block:
+def step_of(kind: Parameter, owner: str, at: float) -> Block:
+    """Return a step of a parameter at some time (s)."""
     step = SinceBias(kind, at) if isinstance(kind, Bias) else StepChange(kind, at)
     return Block(step, owner, slice(0), np.full(_width(kind), TYPICAL[kind]))
 

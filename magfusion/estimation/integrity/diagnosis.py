@@ -113,9 +113,7 @@ def diagnosed(
         return None
     if one.rival is None:
         return known
-    rival = _diagnosis(
-        one.rival, one.rival.text(OF_MOTION), trust.verdict, site, several=several
-    )
+    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), trust.verdict, site, several=several)
     return known._replace(rival=rival, rival_probability=one.rival_probability)
 
 

@@ -79,21 +79,22 @@ class Inertial(Parameter):
         raise NotImplementedError
 
 
-class _Bias(Inertial):
+class Bias(Inertial):
     """A constant bias: the states have one, which its declared sigma keeps near zero."""
 
     columns: ClassVar[slice]
 
     def as_bias(self, stream: Stream) -> Array:
+        """Return ones in its own rows."""
         return np.broadcast_to(np.eye(6)[:, self.columns], (len(stream.imu), 6, 3))
 
 
-class _GyroBias(_Bias):
+class _GyroBias(Bias):
     kind, components, display_unit = "gyro_bias", AXES, ParameterUnit("rad/s", 1.0)
     words, columns = "the bias of the gyro's {axis}", slice(3, 6)
 
 
-class _AccelBias(_Bias):
+class _AccelBias(Bias):
     kind, components, display_unit = "accel_bias", AXES, ParameterUnit("m/s^2", 1.0)
     words, columns = "the bias of the accelerometer's {axis}", slice(0, 3)
 

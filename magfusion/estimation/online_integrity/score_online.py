@@ -27,8 +27,8 @@ from magfusion.estimation.integrity.steel_test import STEEL, steel_of_score
 from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.steel import region_modes
-from magfusion.estimation.online_integrity.beacon_steps import BeaconSteps
 from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.recent_steps import RecentSteps
 from magfusion.estimation.online_integrity.score_epochs import (
     MEMORY,
     Epoch,
@@ -84,7 +84,7 @@ class OnlineScore:
         self._detected_at = {}
         self.correction: Correction | None = None
         self.named = ()
-        self._steps, self._steel = BeaconSteps(site, estimated), region_modes(site)
+        self._steps, self._steel = RecentSteps(site, estimated), region_modes(site)
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
     @property

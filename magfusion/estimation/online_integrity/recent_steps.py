@@ -1,8 +1,8 @@
-"""Steps of beacons' estimated poses at recent times, in the online score test.
+"""Steps of what the state estimates at recent times, in the online score test.
 
-A beacon that is moved contradicts no fixed parameter where its pose is estimated.  From the step
-on, the estimate of the pose errs by it: the response to a unit step begins as minus one there, and
-is then propagated as that of any other error.
+A beacon that is moved contradicts no fixed parameter where its pose is estimated, nor does a bias
+that jumps.  From the step on, the estimate errs by it: the response to a unit step begins as minus
+one there, and is then propagated as that of any other error.
 """
 
 from collections.abc import Iterator
@@ -11,46 +11,48 @@ from itertools import groupby
 
 import numpy as np
 
+from magfusion.estimation.graph import state
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.change_detection import (
     CHANGED,
     MOST_BEACONS,
-    TYPICAL,
-    StepChange,
     changed_name,
+    step_of,
     step_time,
 )
 from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
 from magfusion.estimation.integrity.released_fault import gains
-from magfusion.estimation.integrity.suspects import Suspect
+from magfusion.estimation.integrity.suspects import ACCEL_BIAS, GYRO_BIAS, Suspect
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.model.parameters import BEACON_POSITION, BEACON_ROTATION, Block
 from magfusion.model.site import Site
 from magfusion.units import Array
 
 ONSET_INTERVAL = 2.0  # s; a step between two is tested as at the next one
+BIASES = {ACCEL_BIAS: state.ACCEL_BIAS, GYRO_BIAS: state.GYRO_BIAS}  # their rows of the tangent
 MOST_ONSETS = 6  # times of tested steps; the older ones are farther apart
 
 
-class BeaconSteps:
-    """The tested steps: of the pose of each beacon with an estimated one.
+class RecentSteps:
+    """The tested steps: of each beacon's estimated pose, and of the biases.
 
     `estimated`: calibration parameters in the state's tangent.
     """
 
     def __init__(self, site: Site, estimated: tuple[Block, ...]) -> None:
         kinds = (BEACON_POSITION, BEACON_ROTATION)
-        own = [block for block in estimated if block.parameter in kinds]
-        self._blocks = tuple(own) if 1 < len(site.beacons) <= MOST_BEACONS else ()
-        at = [np.arange(b.columns.start, b.columns.stop) for b in self._blocks]
-        self._rows = MOTION + np.concatenate([np.zeros(0, dtype=np.int64), *at])
-        self._unit = np.concatenate(
-            [np.zeros(0), *(np.full(len(b.sigma), TYPICAL[b.parameter]) for b in self._blocks)]
-        )
+        poses = [b for b in estimated if b.parameter in kinds]
+        poses = poses if 1 < len(site.beacons) <= MOST_BEACONS else []
+        biases = BIASES if site.platform.inertial else {}
+        self._steps = (*((b.parameter, b.owner) for b in poses), *((b, "imu") for b in biases))
+        columns = [slice(MOTION + b.columns.start, MOTION + b.columns.stop) for b in poses]
+        rows = [np.arange(s.start, s.stop) for s in (*columns, *biases.values())]
+        self._rows = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
+        self._unit = np.concatenate([np.zeros(0), *(b.sigma for b in self._blocks(0.0))])
 
     def is_due(self, sums: Sums | None, time: float) -> bool:
         """Return whether a new onset is to be tested from a time (s) on."""
-        if sums is None or not self._blocks:
+        if sums is None or not self._steps:
             return False
         return len(sums.onsets) == 0 or time >= sums.onsets[-1] + ONSET_INTERVAL
 
@@ -85,14 +87,14 @@ class BeaconSteps:
     def blocks(self, onsets: tuple[float, ...], first: int) -> list[Block]:
         """Return the steps as parameters, with their columns from the first on."""
         result = []
-        for onset in onsets:
-            for block in self._blocks:
-                own = slice(first, first + len(block.sigma))
-                sigma = np.full(len(block.sigma), TYPICAL[block.parameter])
-                step = StepChange(block.parameter, onset)
-                result.append(Block(step, block.owner, own, sigma))
-                first = own.stop
+        for block in (block for onset in onsets for block in self._blocks(onset)):
+            own = slice(first, first + len(block.sigma))
+            result.append(block._replace(columns=own))
+            first = own.stop
         return result
+
+    def _blocks(self, onset: float) -> list[Block]:
+        return [step_of(kind, owner, onset) for kind, owner in self._steps]
 
     def candidates(self, steps: list[Block], information: Array, gradient: Array) -> list[Suspect]:
         """Return what one event may have moved, where there is evidence for one of so many."""
@@ -108,9 +110,9 @@ class BeaconSteps:
         return result
 
     def _events(self, steps: list[Block]) -> Iterator[tuple[Block, ...]]:
-        """Yield the position of a beacon, its attitude, and both, at each onset."""
-        for _, blocks in groupby(steps, lambda b: (step_time(b), b.owner)):
+        """Yield a bias, the position of a beacon, its attitude, and both, at each onset."""
+        for (_, owner), blocks in groupby(steps, lambda b: (step_time(b), b.owner)):
             own = tuple(blocks)
             yield from ((block,) for block in own)
-            if len(own) > 1:
+            if len(own) > 1 and owner != "imu":
                 yield own
