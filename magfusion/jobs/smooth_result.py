@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
-from magfusion.estimation.integrity.change_detection import changed_beacon
+from magfusion.estimation.integrity.change_detection import changed_beacon, explained_throughout
 from magfusion.estimation.integrity.correction import Correction, continued, corrections, spread_of
 from magfusion.estimation.integrity.diagnosis import (
     diagnosed,
@@ -124,7 +124,10 @@ def finished(
         for name, onset in excluded_to_the_end(separated).items()
         if (test := changed_beacon(result, log, name, onset)) is not None
     }
-    if tests and steel_explains(result, log, max(test.gain for test in tests.values())):
+    changed_by = max((test.gain for test in tests.values()), default=0.0)
+    if tests and (
+        explained_throughout(result, log, changed_by) or steel_explains(result, log, changed_by)
+    ):
         separated, tests = separated_smooth(result, risk, excluding=False), {}
     changes = {name: test.findings[0] for name, test in tests.items()}
     give_back_memory()

@@ -23,7 +23,7 @@ from magfusion.estimation.integrity.released_fault import (
     release_fault,
     release_gain,
 )
-from magfusion.estimation.integrity.score import answered, scores_of
+from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import (
     ACCEL_BIAS,
     GYRO_BIAS,
@@ -170,7 +170,11 @@ def changed(case: Case) -> TestResult:
     if not any(np.mean(cause.distance) > COVERED for cause in significant):
         return NOTHING
     cause = max(significant, key=lambda one: one.gain)
-    if cause.gain < _throughout(case, information, gradient):
+    assert case.score is not None
+    own = slice(0, dimension(case.score.fixed))
+    if cause.gain < _throughout(
+        result.declared.site, case.score, information[own, own], gradient[own]
+    ):
         return NOTHING  # it was wrong from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     certain = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
@@ -217,21 +221,20 @@ def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[
     ]
 
 
-def _throughout(case: Case, information: Array, gradient: Array) -> float:
+def explained_throughout(result: Smoothed, log: Log, rival: float) -> bool:
+    """Return whether a parameter that is wrong throughout explains more than a rival's gain."""
+    site = result.declared.site
+    scores = scores_of(result, logged(log, site)[0].imu, [])
+    if scores is None:
+        return False
+    evidence = scores.every.with_declared(tolerance=True)
+    return _throughout(site, scores.every, *evidence) > rival
+
+
+def _throughout(site: Site, score: Score, information: Array, gradient: Array) -> float:
     """Return the largest gain of a fixed parameter that is wrong throughout."""
-    assert case.score is not None
-    own = slice(0, dimension(case.score.fixed))
-    gains = [
-        result.gain
-        for fault in suspects(case.result.declared.site, case.score.fixed)
-        if (
-            result := release_fault(
-                case.pose_cov, case.score, fault, information[own, own], gradient[own]
-            )
-        )
-        is not None
-    ]
-    return max(gains, default=0.0)
+    every = (release_gain(one, information, gradient) for one in suspects(site, score.fixed))
+    return max((one.gain for one in every if one is not None), default=0.0)
 
 
 def _blocks(site: Site, at: float) -> list[Block]:

@@ -15,6 +15,7 @@ from magfusion.estimation.integrity.suspects import (
     GYRO_BIAS,
     GYRO_G_SENSITIVITY,
     GYRO_SCALE,
+    SAMPLE_RATE,
     STRETCH,
     TILT,
     TYPICAL_TILT,
@@ -80,6 +81,13 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
 
     `step` (h,): of all fixed parameters, in typical errors.
     """
+    if (
+        fault.code == SAMPLE_RATE
+    ):  # what drives drift alike is the clock that they are compared with
+        (block, *_) = fault.blocks
+        faster = float((block.sigma * step[block.columns])[0])
+        rate = (1.0 + site.platform.magnetometer.clock_rate) * (1.0 + faster) - 1.0
+        return with_magnetometer(site, clock_rate=rate)
     if fault.code in (TILT, STRETCH):
         size = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
         turn = stretch = EYE

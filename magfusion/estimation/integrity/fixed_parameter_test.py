@@ -16,6 +16,7 @@ from magfusion.estimation.integrity.score import Score, field_residual, moved_es
 from magfusion.estimation.integrity.suspects import (
     ACCEL_BIAS,
     GYRO_BIAS,
+    SAMPLE_RATE,
     STRETCH,
     TILT,
     TYPICAL_TILT,
@@ -159,6 +160,11 @@ def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault]
         stretch = -float(np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0][0])
         result = f"all positions are {stretch:+.2g} % too far from the origin"
         remedy = "Multiply all positions by a common factor: check the tape, or the unit"
+    elif cause.fault.code == SAMPLE_RATE:
+        block = cause.fault.blocks[0]
+        fast = -1e6 * float((block.sigma * cause.step[block.columns])[0])
+        result = f"the stamps run {fast:+.3g} ppm fast against the drives"
+        remedy = "Check the sample rate with which the stamps were made"
     elif len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
         block = cause.fault.blocks[0]
         factor = float(np.exp(block.sigma * cause.step[block.columns])[0])

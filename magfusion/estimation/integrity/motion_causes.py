@@ -72,6 +72,7 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
         EYE,
         gravity=0.0,
     )
+    yield _upside_down(known, before, site)
     yield _scaled(known, before, site)
     yield from _accel_scaled(known, before, site)
     yield from _freed(known, before, site)
@@ -159,6 +160,31 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
             known.freedom,
             3,
         )
+
+
+def _upside_down(known: Compared, before: float, site: Site) -> Explanation:
+    """Return what a survey in axes north, east, down would explain."""
+    after, _ = known.explained(EYE, EYE, gravity=-1.0)
+    turn, earth = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), None
+    if site.earth_field_world is not None:
+        earth = turn @ site.earth_field_world
+    beacons = (
+        replace(
+            beacon,
+            position_world=turn @ beacon.position_world,
+            world_from_beacon=turn @ beacon.world_from_beacon,
+        )
+        for beacon in site.beacons
+    )
+    return Explanation(
+        "survey_axes",
+        "the survey's axes are north, east, down",
+        "Give all vectors of world in axes east, north, up, the beacons' attitudes, too.",
+        before,
+        after,
+        known.freedom,
+        site=replace(site, beacons=tuple(beacons), earth_field_world=earth),
+    )
 
 
 def _mounting_remedy(site: Site, axes: Array) -> str:

@@ -257,7 +257,7 @@ CODE: dict[Parameter, str] = {
     AIDING_POSITION: "aiding_lever_arm",
 }
 
-TILT, STRETCH = "survey_tilt", "survey_scale"
+TILT, STRETCH, SAMPLE_RATE = "survey_tilt", "survey_scale", "sample_rate"
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
 # seldom tilted or stretched, and gyros seldom are that bad.
 RARE = 0.1
@@ -337,6 +337,12 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
         for block in moments:
             common[block.columns] = 1.0
         yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
+    drifts = tuple(b for b in held if b.parameter == DRIFT)
+    if len(drifts) == len(site.beacons) > 1 and not site.platform.further:
+        common = np.zeros((size, 1))
+        for block in drifts:
+            common[block.columns] = 1.0
+        yield Suspect("the sampling rate of the magnetometer", drifts, common, SAMPLE_RATE)
     if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
         blocks = tuple(surveyed)
         tilt = survey_tilt(site, blocks, size)
