@@ -10,6 +10,7 @@ from test_smoothed_separation import EPOCHS, _walk
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online_integrity import recent_steps
 from magfusion.estimation.online_integrity.score_epochs import (
     Epoch,
     EpochTransition,
@@ -31,7 +32,9 @@ def _waiting() -> tuple[Navigator, Sums, list[Epoch]]:
     score = navigator._loop.running.update.score
     score.settle()
     score._scored_at = np.inf
-    _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
+    with pytest.MonkeyPatch.context() as patch:  # a new onset would not let them wait
+        patch.setattr(recent_steps, "ONSET_INTERVAL", np.inf)
+        _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
     assert score._sums is not None
     return navigator, score._sums, list(score._waiting)
 

@@ -217,8 +217,8 @@ def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
     }
     kept = [f for f in kept if f.verdict is not Verdict.DOUBTFUL or f.code not in traces]
     explained = tuple(sorted(traces - {"changed"}))
-    # Samples that are wrong throughout look like any change.
-    late = any(f.code in ("repeated_samples", *NOT_MEASURED) for f in trust.reasons)
+    # Samples that are late throughout look like any change.
+    late = any(f.code == "repeated_samples" for f in trust.reasons)
     weight = 0.0 if late else CAUSE_FIRST
     first = (replace(f, weight=weight, explained=explained) for f in changes.values())
     return replace(trust, findings=(*kept, *first))

@@ -221,7 +221,7 @@ USUAL: dict[Parameter, float] = TOLERANCE | {
 }
 
 # What is larger is another mistake: a unit, an axis, gravity.
-LARGEST: dict[Parameter, float] = {GYRO_BIAS: 0.5, ACCEL_BIAS: 1.5}
+LARGEST: dict[Parameter, float] = {GYRO_BIAS: 0.5, ACCEL_BIAS: 1.5, GYRO_ALIGNMENT: 20.0 * DEGREE}
 
 # Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
 CODE: dict[Parameter, str] = {
@@ -331,18 +331,7 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
     surveyed = [b for b in held if b.parameter in (BEACON_ROTATION, BEACON_POSITION)]
     several += [(text, [b for b in surveyed if b.owner == name]) for name, text in poses.items()]
     yield from (together(name, blocks) for name, blocks in several if len(blocks) > 1)
-    moments = [b for b in held if b.parameter == LOG_MOMENT]
-    if len(moments) > 1:
-        common = np.zeros((size, 1))
-        for block in moments:
-            common[block.columns] = 1.0
-        yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
-    drifts = tuple(b for b in held if b.parameter == DRIFT)
-    if len(drifts) == len(site.beacons) > 1 and not site.platform.further:
-        common = np.zeros((size, 1))
-        for block in drifts:
-            common[block.columns] = 1.0
-        yield Suspect("the sampling rate of the magnetometer", drifts, common, SAMPLE_RATE)
+    yield from _common(site, held, size)
     if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
         blocks = tuple(surveyed)
         tilt = survey_tilt(site, blocks, size)
@@ -351,6 +340,20 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
     if len(places) == len(site.beacons) > 1:
         stretch = survey_scale(site, places, size)
         yield Suspect("the scale of the survey", places, stretch, STRETCH, RARE)
+
+
+def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]:
+    """Yield what would have a number of all beacons wrong alike."""
+    kinds: dict[str, tuple[Parameter, str]] = {f"the moments of {_beacons(site)}": (LOG_MOMENT, "")}
+    if not site.platform.further:
+        kinds["the sampling rate of the magnetometer"] = (DRIFT, SAMPLE_RATE)
+    for name, (parameter, code) in kinds.items():
+        own = tuple(b for b in held if b.parameter == parameter)
+        if len(own) > 1:
+            common = np.zeros((size, 1))
+            for block in own:
+                common[block.columns] = 1.0
+            yield Suspect(name, own, common, code)
 
 
 def survey_tilt(site: Site, surveyed: tuple[Block, ...], size: int) -> Array:

@@ -25,8 +25,6 @@ from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 
-MARGIN = 0.5  # s; of a span that a start uses
-
 
 class EstimationLoop:
     """The parts of a navigator, and the order in which they process its data.
@@ -57,6 +55,11 @@ class EstimationLoop:
         self.possible: tuple[Correction, ...] = ()
         self.tried: Correction | None = None
         self.remainder: Correction | None = None
+
+    @property
+    def is_lost_repeatedly(self) -> bool:
+        """Whether inertial data lead away from the fields again and again."""
+        return any(finding.code == "restarts" for finding in self.reports.judgement.reasons)
 
     @property
     def counts(self) -> Counter[str]:
@@ -203,7 +206,7 @@ class EstimationLoop:
         self.tried = correction
         self.corrections = earlier.corrections.further(correction, declared, reasons)
         self.reports.discontinuities.counter = reports.reset_counter + (reports.until > -np.inf)
-        self.search.needed = max(self.search.needed, span - MARGIN)
+        self.search.wait_for(span)
 
 
 def _on_site(state: State, site: Site) -> State:

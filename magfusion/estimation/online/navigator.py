@@ -363,9 +363,17 @@ class Navigator:
     def take_corrections(self) -> tuple[Correction, ...]:
         """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
         possible, self._loop.possible = self._loop.possible, ()
-        applied = self._loop.corrections
-        is_due = possible and applied.due(self._history.newest)
-        return applied.offered(possible) if is_due else ()
+        applied, restarts = self._loop.corrections, self._loop.is_lost_repeatedly
+        if not (possible or restarts) or not applied.due(self._history.newest):
+            return ()
+        return applied.offered((*(self._by_a_new_start() if restarts else ()), *possible))
+
+    def _by_a_new_start(self) -> tuple[Correction, ...]:
+        """Return what a start on the newest input shows to be wrong with the site."""
+        again = Navigator(self.site, self.settings)
+        again._loop.search.wait_for(self._history.span)
+        self._history.replay(again)
+        return again._loop.possible
 
     def with_correction(self, correction: Correction) -> "Navigator":
         """Return a navigator of a corrected site that has processed the newest input again.

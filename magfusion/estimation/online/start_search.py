@@ -18,6 +18,7 @@ from magfusion.estimation.online.queue.arrivals import Arrivals
 from magfusion.model.parameters import Block
 from magfusion.model.site import Site
 
+MARGIN = 0.5  # s; of a span that a start uses
 LONGEST = 4.0  # durations of a start; as much is kept, and an open hypothesis waits so long
 
 
@@ -36,6 +37,10 @@ class StartSearch:
         self._site, self._settings = site, settings
         self.needed = first_try(site, settings.start_duration)
         self.why, self.earlier = NoStart(), None
+
+    def wait_for(self, span: float) -> None:
+        """Start on all input that is to come within some seconds, a span (s)."""
+        self.needed = max(self.needed, span - MARGIN)
 
     def attempt(self, arrived: Arrivals, *, diagnose: bool) -> OnlineStart | NoStart | None:
         """Return the result of an attempt; None as long as there are too few data."""
