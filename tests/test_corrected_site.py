@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.corrected_site import corrected_site, with_intrinsics
+from magfusion.estimation.integrity.corrected_site import (
+    NO_GRAVITY,
+    corrected_site,
+    with_intrinsics,
+)
 from magfusion.estimation.integrity.correction import Correction, released
 from magfusion.estimation.integrity.suspects import (
+    GRAVITY,
     GYRO_ALIGNMENT,
+    GYRO_BIAS,
     GYRO_G_SENSITIVITY,
     GYRO_SCALE,
+    SAMPLE_RATE,
     TILT,
     TYPICAL_TILT,
     held_blocks,
@@ -107,3 +114,24 @@ def test_a_key_that_goes_is_told_too() -> None:
     changed = changed_keys(declared, replace(SITE, location=None))
     assert "world.earth_field_t" in changed
     assert changed["world.location.latitude_deg"] is None
+
+
+def test_a_bias_beyond_its_sigma_is_declared_to_be_so_uncertain() -> None:
+    fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter is GYRO_BIAS)
+    step = fault.combine @ np.array([1.0, -4.0, 0.0])  # of 0.01 rad/s
+    corrected = corrected_site(SITE, fault, step)
+    assert changed_keys(SITE, corrected) == {"platform.imu.gyro_bias_sigma": pytest.approx(0.04)}
+
+
+def test_drifts_of_all_beacons_alike_are_the_magnetometers_clock() -> None:
+    fault = next(one for one in suspects(SITE, FIXED) if one.code == SAMPLE_RATE)
+    assert {block.owner for block in fault.blocks} == {beacon.name for beacon in SITE.beacons}
+    corrected = corrected_site(SITE, fault, fault.combine @ np.array([20.0]))  # of 1 ppm
+    changed = changed_keys(SITE, corrected)
+    assert changed == {"platform.magnetometer.clock_rate_ppm": pytest.approx(20.0)}
+
+
+def test_gravity_that_was_removed_is_declared_as_nearly_none() -> None:
+    fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter is GRAVITY)
+    corrected = corrected_site(SITE, fault, fault.combine @ np.array([-981.0]))  # of 0.01 m/s^2
+    assert changed_keys(SITE, corrected) == {"world.gravity_m_s2": NO_GRAVITY}

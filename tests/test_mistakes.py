@@ -117,3 +117,30 @@ def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
     assert wrong.claimed_m < 2.0 * good.claimed_m
     assert wrong.error_deg < 1.1 * good.error_deg
     assert wrong.remedy == "works"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("estimator", "mistakes"),
+    [
+        ("ekf", ("accel_bias", "gyro_deg_s", "gyro_x_sign", "magnetometer_clock_20ppm")),
+        ("smooth", ("gyro_bias", "gyro_sign", "survey_ned", "survey_tilted_5deg")),
+    ],
+)
+def test_units_signs_biases_and_frames_are_undone_and_their_remedies_work(
+    estimator: str, mistakes: tuple[str, ...]
+) -> None:
+    good, *rows = run(Config(mistakes, ("moving",), (estimator,), remedies=True), {"workers": 1})
+    for row in rows:
+        assert row.right, row.mistake
+        assert row.remedy == "works", row.mistake
+        assert row.error_m < 2.0 * good.error_m, row.mistake
+
+
+@pytest.mark.slow
+def test_a_bias_that_jumps_is_named_online_and_covered() -> None:
+    few = Config(("gyro_bias_steps", "accel_bias_steps"), ("moving",), ("ekf",))
+    for row in run(few, {"workers": 1})[1:]:
+        assert row.codes[0] == "changed", row.mistake
+        assert row.nees is not None
+        assert 1.0 < row.nees < 12.6  # 95 % of chi square of six
