@@ -259,7 +259,7 @@ CODE: dict[Parameter, str] = {
 
 TILT, STRETCH, SAMPLE_RATE = "survey_tilt", "survey_scale", "sample_rate"
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
-# seldom tilted or stretched, and gyros seldom are that bad.
+# seldom tilted, and gyros seldom are that bad.
 RARE = 0.1
 RARELY_WRONG: tuple[Parameter, ...] = (GYRO_ALIGNMENT, GYRO_G_SENSITIVITY, GRAVITY)
 TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned by more
@@ -339,7 +339,7 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
     places = tuple(b for b in surveyed if b.parameter == BEACON_POSITION)
     if len(places) == len(site.beacons) > 1:
         stretch = survey_scale(site, places, size)
-        yield Suspect("the scale of the survey", places, stretch, STRETCH, RARE)
+        yield Suspect("the scale of the survey", places, stretch, STRETCH)
 
 
 def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]:
