@@ -8,7 +8,12 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
 from magfusion.estimation.integrity.change_detection import changed_beacon, explained_throughout
-from magfusion.estimation.integrity.correction import Correction, continued, corrections, spread_of
+from magfusion.estimation.integrity.correction import (
+    Correction,
+    continued,
+    corrections,
+    spread_with_rivals,
+)
 from magfusion.estimation.integrity.diagnosis import (
     diagnosed,
     with_changed_beacons,
@@ -212,7 +217,8 @@ def _with_uncertainty(result: Smoothed, correction: Correction, score: Score | N
     cov = result.states.pose_cov
     if cov is None:
         return result
-    states = replace(result.states, pose_cov=cov + spread_of(correction, score))
+    spread = spread_with_rivals(correction, score)
+    states = replace(result.states, pose_cov=cov + spread)
     return replace(result, states=states)
 
 

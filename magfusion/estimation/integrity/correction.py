@@ -1,6 +1,6 @@
 """Corrections: mistakes that explain a log, each with the site in which it is undone."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Generic, NamedTuple, TypeVar
 
@@ -15,6 +15,7 @@ from magfusion.estimation.integrity.corrected_site import (
 )
 from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.fixed_parameter_test import (
+    LEAST_EVIDENCE,
     amounts,
     error_in_words,
     finding_of,
@@ -22,10 +23,10 @@ from magfusion.estimation.integrity.fixed_parameter_test import (
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import Suspect, suspects
+from magfusion.estimation.integrity.suspects import LEVER_ARM, TYPICAL, Bias, Suspect, suspects
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
-from magfusion.model.parameters import Block, Calibration, initial_calibration
+from magfusion.model.parameters import SENSOR_POSITION, Block, Calibration, initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -38,15 +39,23 @@ CORRECTED = " The result is corrected for it."
 REFINED = " The remedy is refined by the inertial data."
 
 
+class Rival(NamedTuple):
+    """What explains a log as well as a correction: it is one or the other."""
+
+    name: str  # of a candidate fault of the corrected site, as which the rival would appear
+    size: Array  # of that fault, along its directions
+    spread: Array  # (states or 1, 6, 6), covariance of the poses by it
+    is_frame: bool = False  # whether only the frame of the result differs, and the lever arm
+
+
 class Correction(NamedTuple):
     """A mistake that explains a log."""
 
     finding: Finding  # what is wrong
     site: Site  # in which it is undone
     fault: Suspect | None = None  # the candidate fault, if it is an incorrect fixed parameter
-    # (states or 1, 6, 6), covariance of the poses by other mistakes that would explain the log as
-    # well
-    spread: Array | None = None
+    rivals: tuple[Rival, ...] = ()
+    step_spread: Array | None = None  # (states or 1, 6, 6), by the uncertainty of the step
     clear: bool = False  # whether snapshots of the fields alone are sure of it
     # whether they estimate values of parameters, and do not choose among usual mistakes
     is_estimate: bool = False
@@ -57,6 +66,13 @@ class Correction(NamedTuple):
     words: str = ""  # by how much they are wrong, as in the finding
     released: tuple[Block, ...] = ()  # parameters that the corrected solution estimates
     is_rival: bool = False  # whether it takes the place of one that was contradicted
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the corrected solution estimates what was wrong."""
+        fault = self.fault
+        of_states = fault is not None and isinstance(fault.blocks[0].parameter, Bias)
+        return of_states or bool(self.released)
 
 
 class Trial(NamedTuple, Generic[T]):
@@ -97,19 +113,24 @@ def _by_score(
 ) -> Correction:
     """Return the correction of a cause by the score, with its rival."""
     weight = np.exp([0.5 * (rival.posterior_gain - best.posterior_gain) for rival in rivals])
-    spread = np.zeros((len(best.moved), 6, 6))
-    for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
-        spread += share * _outer(rival.moved - best.moved)
+    others = [
+        Rival(one.fault.name, _along(one.fault, one.step), share * _outer(one.moved - best.moved))
+        for one, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True)
+    ]
     known = Correction(
         finding,
         corrected_site(site, best.fault, best.step),
         best.fault,
-        spread,
         rival=_by_score(site, finding_of(site, rivals[0]), rivals[0]) if rivals else None,
         step=best.step,
         words=error_in_words(site, best),
     )
-    return known._replace(spread=_with_rival_frame(site, known, 0.5))
+    return known._replace(rivals=(*others, *_other_frame(site, known.site, 0.5)))
+
+
+def _along(fault: Suspect, step: Array) -> Array:
+    """Return a step along the directions of a candidate fault."""
+    return np.asarray(np.linalg.lstsq(fault.combine, step, rcond=None)[0])
 
 
 def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
@@ -121,14 +142,12 @@ def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
         clear=diagnosis.is_clear,
         is_estimate=diagnosis.is_estimate,
     )
-    spread = _with_rival_frame(site, known, diagnosis.rival_probability)
+    known = known._replace(rivals=_other_frame(site, known.site, diagnosis.rival_probability))
     other = diagnosis.rival
     if other is None or other.site is None:
-        return known._replace(spread=spread)
+        return known
     # It is tried only where the first is contradicted: its frame is no longer in question.
-    return known._replace(
-        spread=spread, rival=known._replace(finding=other.finding, site=other.site)
-    )
+    return known._replace(rival=known._replace(finding=other.finding, site=other.site, rivals=()))
 
 
 def best_trial(
@@ -239,23 +258,23 @@ def as_estimated(
     return correction._replace(finding=finding, site=with_sigmas(after, own, sigmas))
 
 
-def _with_rival_frame(site: Site, correction: Correction, probability: float) -> Array | None:
-    """Return the spread of a correction, with that of the other of two frames.
+def _other_frame(declared: Site, corrected: Site, probability: float) -> tuple[Rival, ...]:
+    """Return the other of two frames where a magnetometer or an IMU is corrected for a turn.
 
-    A turned magnetometer and a turned IMU differ by the frame of the result and the lever arm only.
-    `site`: as declared. `probability`: of the other frame.
+    They differ by the frame of the result and the lever arm only.
     """
-    before, after = (one.platform for one in (site, correction.site))
+    before, after = declared.platform, corrected.platform
     one, other = before.magnetometer, after.magnetometer
     turn = Rotation.from_matrix(other.body_from_sensor @ one.body_from_sensor.T)
     turn *= _turn_of_imu(before.imu_intrinsics, after.imu_intrinsics)
     turn_body = turn.as_rotvec()
     if not turn_body.any():
-        return correction.spread
+        return ()
     # The magnetometer stays where it is found; the body moves about it.
     shift_body = other.position_body - turn.apply(one.position_body)
     spread = probability * _outer(np.concatenate([turn_body, shift_body])[None])
-    return spread if correction.spread is None else spread + correction.spread
+    size = -shift_body / TYPICAL[SENSOR_POSITION]
+    return (Rival(LEVER_ARM, size, spread, is_frame=True),)
 
 
 def _turn_of_imu(before: ImuIntrinsics | None, after: ImuIntrinsics | None) -> Rotation:
@@ -301,16 +320,60 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
     return correction._replace(site=new_site, fault=rest.fault, step=rest.step, released=())
 
 
+def open_rivals(
+    correction: Correction, candidates: Sequence[Suspect], information: Array, gradient: Array
+) -> list[Rival]:
+    """Return the rivals of a correction that the corrected data do not refute.
+
+    Where the corrected solution estimates what was wrong, a rival appears as an error of its size
+    in another parameter. `information`, `gradient`: of all fixed parameters, and others after them.
+    """
+
+    def is_refuted(rival: Rival) -> bool:
+        candidate = next((one for one in candidates if one.name == rival.name), None)
+        if candidate is None or not (rival.is_frame or correction.is_estimated):
+            return False
+        combine = np.zeros((len(gradient), candidate.combine.shape[1]))
+        combine[: len(candidate.combine)] = candidate.combine
+        known = combine.T @ information @ combine
+        rest = combine.T @ gradient - known @ rival.size
+        # Twice the increase of the cost from the estimate to that size.
+        return float(rest @ np.linalg.pinv(known) @ rest) > LEAST_EVIDENCE
+
+    return [rival for rival in correction.rivals if not is_refuted(rival)]
+
+
+def _of_states(spread: Array, count: int) -> Array:
+    """Return a covariance of some states for a number of others."""
+    return spread if len(spread) in (1, count) else np.mean(spread, axis=0, keepdims=True)
+
+
+def spread_with_rivals(correction: Correction, score: Score | None) -> Array:
+    """Return the covariance as `spread_of`, and by what explains the log as well."""
+    spread, rivals = spread_of(correction, score), list(correction.rivals)
+    if score is not None:
+        candidates = list(suspects(correction.site, score.fixed))
+        rivals = open_rivals(correction, candidates, *score.with_declared(tolerance=False))
+    for rival in rivals:
+        spread = spread + _of_states(rival.spread, 1 if score is None else len(score.by_pose))
+    return spread
+
+
 def spread_of(correction: Correction, score: Score | None) -> Array:
-    """Return the covariance of the poses by the uncertainty of a correction, and its remainder."""
-    spread = np.zeros((1, 6, 6)) if correction.spread is None else correction.spread
+    """Return the covariance of the poses by the uncertainty of a correction, and its remainder.
+
+    Without that by its rivals.
+    """
+    spread = np.zeros((1, 6, 6))
+    if correction.step_spread is not None and not correction.is_estimated:
+        spread = correction.step_spread
     rest = _remaining(correction, score)
     if rest is None or score is None:
         return spread
     by_pose = score.by_pose
-    if len(spread) not in (1, len(by_pose)):  # of the states before the correction
-        spread = np.mean(spread, axis=0, keepdims=True)
-    spread = spread + by_pose @ rest.known_cov @ np.swapaxes(by_pose, 1, 2)
+    spread = _of_states(spread, len(by_pose)) + by_pose @ rest.known_cov @ np.swapaxes(
+        by_pose, 1, 2
+    )
     if rest.chi_square < LITTLE * rest.freedom:
         return np.asarray(spread)
     return np.asarray(spread + _outer(by_pose @ rest.step))

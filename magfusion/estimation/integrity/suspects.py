@@ -257,6 +257,7 @@ CODE: dict[Parameter, str] = {
     AIDING_POSITION: "aiding_lever_arm",
 }
 
+LEVER_ARM = "the lever arm of the magnetometer"
 TILT, STRETCH, SAMPLE_RATE = "survey_tilt", "survey_scale", "sample_rate"
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
 # seldom tilted, and gyros seldom are that bad.
@@ -395,7 +396,7 @@ def spoken_name(block: Block) -> str:
     """Return what a block is called in a sentence."""
     names = {
         SENSOR_ROTATION: "the mounting of the magnetometer",
-        SENSOR_POSITION: "the lever arm of the magnetometer",
+        SENSOR_POSITION: LEVER_ARM,
         MATRIX: "the magnetometer's matrix (body iron, gains, axes)",
         RESPONSE_GAIN: "the magnetometer's gains relative to its x",
         RESPONSE_PHASE: "the magnetometer's phases relative to its x",

@@ -14,7 +14,7 @@ import numpy as np
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.estimation.integrity.change_detection import CHANGED, change_finding
-from magfusion.estimation.integrity.correction import Correction, corrections
+from magfusion.estimation.integrity.correction import Correction, Rival, corrections, open_rivals
 from magfusion.estimation.integrity.fixed_parameter_test import (
     LEAST_EVIDENCE,
     NamedCause,
@@ -81,6 +81,7 @@ class OnlineScore:
         self._sums, self._scored_at, self._judgement = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
         self._epochs_since_score = 0
+        self._evidence: tuple[Array, Array] | None = None  # of the last result
         self._detected_at = {}
         self.correction: Correction | None = None
         self.named = ()
@@ -230,6 +231,7 @@ class OnlineScore:
             fixed = [one._replace(combine=np.pad(one.combine, more)) for one in known]
             return [*fixed, *self._steps.candidates(steps, information, gradient)]
 
+        self._evidence = score.with_declared(tolerance=False)
         causes = list(causes_of(pose_cov, score, candidates))
         self.correction, self.named = None, ()
         if targets.steel and (bent := self._steel_of(score, causes)) is not None:
@@ -251,10 +253,14 @@ class OnlineScore:
         finding = finding_of(self.targets.site, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
         spread = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
-        if correction.spread is not None:
-            spread = spread + correction.spread
         rival = self._correction_of(score, rivals[0], []) if rivals else None
-        return correction._replace(spread=spread, rival=rival)
+        return correction._replace(step_spread=spread, rival=rival)
+
+    def open_rivals(self, correction: Correction) -> list[Rival]:
+        """Return the rivals of a correction that the data do not refute up to the last result."""
+        if self._evidence is None:
+            return list(correction.rivals)
+        return open_rivals(correction, self.targets.fault_candidates, *self._evidence)
 
     def _steel_of(self, score: Score, named: Sequence[NamedCause]) -> Judgement | None:
         """Return the judgement by steel; None if it does not explain the data better."""
