@@ -13,11 +13,6 @@ from magfusion.estimation.integrity.corrected_site import (
 )
 from magfusion.estimation.integrity.correction import Correction, released
 from magfusion.estimation.integrity.suspects import (
-    GRAVITY,
-    GYRO_ALIGNMENT,
-    GYRO_BIAS,
-    GYRO_G_SENSITIVITY,
-    GYRO_SCALE,
     SAMPLE_RATE,
     TILT,
     TYPICAL_TILT,
@@ -26,6 +21,13 @@ from magfusion.estimation.integrity.suspects import (
 )
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
+from magfusion.model.parameters.inertial import (
+    GRAVITY,
+    GYRO_ALIGNMENT,
+    GYRO_BIAS,
+    GYRO_G_SENSITIVITY,
+    GYRO_SCALE,
+)
 from magfusion.model.site import Location
 from magfusion.model.trust import Finding
 from magfusion.simulation.demo_site import demo_site

@@ -24,16 +24,7 @@ from magfusion.estimation.integrity.released_fault import (
     release_gain,
 )
 from magfusion.estimation.integrity.score import Score, answered, scores_of
-from magfusion.estimation.integrity.suspects import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
-    Bias,
-    Inertial,
-    Stream,
-    Suspect,
-    spoken_name,
-    suspects,
-)
+from magfusion.estimation.integrity.suspects import Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
     BEACON_POSITION,
@@ -46,6 +37,7 @@ from magfusion.model.parameters import (
     dimension,
     prior_sigma,
 )
+from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS, Bias, Inertial, Stream
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

@@ -8,13 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.suspects import (
-    ACCEL_BIAS,
-    ACCEL_SCALE,
-    GRAVITY,
-    GYRO_ALIGNMENT,
-    GYRO_BIAS,
-    GYRO_G_SENSITIVITY,
-    GYRO_SCALE,
     SAMPLE_RATE,
     STRETCH,
     TILT,
@@ -23,6 +16,15 @@ from magfusion.estimation.integrity.suspects import (
 )
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import PHASE, Block, Calibration, Parameter, initial_calibration
+from magfusion.model.parameters.inertial import (
+    ACCEL_BIAS,
+    ACCEL_SCALE,
+    GRAVITY,
+    GYRO_ALIGNMENT,
+    GYRO_BIAS,
+    GYRO_G_SENSITIVITY,
+    GYRO_SCALE,
+)
 from magfusion.model.site import Beacon, Site
 from magfusion.units import Array
 

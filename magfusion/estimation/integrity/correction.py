@@ -23,10 +23,11 @@ from magfusion.estimation.integrity.fixed_parameter_test import (
 from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import LEVER_ARM, TYPICAL, Bias, Suspect, suspects
+from magfusion.estimation.integrity.suspects import LEVER_ARM, TYPICAL, Suspect, suspects
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import SENSOR_POSITION, Block, Calibration, initial_calibration
+from magfusion.model.parameters.inertial import Bias
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array

@@ -8,8 +8,8 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.inertial import ROWS
-from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.model.parameters import Block, dimension
+from magfusion.model.parameters.inertial import Inertial, Stream
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, IntArray
 

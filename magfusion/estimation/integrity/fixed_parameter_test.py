@@ -14,8 +14,6 @@ from magfusion.estimation.data_checks.statistics import sigmas
 from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
 from magfusion.estimation.integrity.suspects import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
     SAMPLE_RATE,
     STRETCH,
     TILT,
@@ -25,6 +23,7 @@ from magfusion.estimation.integrity.suspects import (
 )
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, Parameter, prior_sigma
+from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array

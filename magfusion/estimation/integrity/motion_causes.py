@@ -15,9 +15,10 @@ from magfusion.estimation.integrity.corrected_site import (
 )
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
-from magfusion.estimation.integrity.suspects import ACCEL_BIAS, GYRO_BIAS, LARGEST
+from magfusion.estimation.integrity.suspects import LARGEST
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
+from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array

@@ -6,8 +6,9 @@ import numpy as np
 
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import GRAVITY, LARGEST, USUAL, Inertial, Suspect
+from magfusion.estimation.integrity.suspects import LARGEST, USUAL, Suspect
 from magfusion.model.parameters import AidingParameter
+from magfusion.model.parameters.inertial import GRAVITY, Inertial
 from magfusion.units import Array
 
 FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored

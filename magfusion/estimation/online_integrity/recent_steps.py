@@ -22,9 +22,10 @@ from magfusion.estimation.integrity.change_detection import (
 )
 from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
 from magfusion.estimation.integrity.released_fault import gains
-from magfusion.estimation.integrity.suspects import ACCEL_BIAS, GYRO_BIAS, Suspect
+from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.model.parameters import BEACON_POSITION, BEACON_ROTATION, Block
+from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
 from magfusion.model.site import Site
 from magfusion.units import Array
 

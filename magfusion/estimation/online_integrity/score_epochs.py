@@ -11,7 +11,6 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
 from magfusion.estimation.graph.state import MOTION, State, States, states_of
-from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -20,6 +19,7 @@ from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.model.parameters import Block, Calibration, dimension
+from magfusion.model.parameters.inertial import Inertial, Stream
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray
 
