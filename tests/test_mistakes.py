@@ -144,3 +144,10 @@ def test_a_bias_that_jumps_is_named_online_and_covered() -> None:
         assert row.codes[0] == "changed", row.mistake
         assert row.nees is not None
         assert 1.0 < row.nees < 12.6  # 95 % of chi square of six
+
+
+@pytest.mark.slow
+def test_a_step_that_explains_a_log_as_well_is_not_undone() -> None:
+    """No site has a parameter that changes."""
+    few = Config(("beacon_reversed",), ("rough",), ("ekf",), seed=15)
+    assert not summed(run(few, {"workers": 1})).tracebacks

@@ -7,6 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.change_detection import CHANGED
 from magfusion.estimation.integrity.corrected_site import (
     corrected_site,
     released_blocks,
@@ -118,11 +119,12 @@ def _by_score(
         Rival(one.fault.name, _along(one.fault, one.step), share * _outer(one.moved - best.moved))
         for one, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True)
     ]
+    other = next((one for one in rivals if one.code != CHANGED), None)  # no site undoes a step
     known = Correction(
         finding,
         corrected_site(site, best.fault, best.step),
         best.fault,
-        rival=_by_score(site, finding_of(site, rivals[0]), rivals[0]) if rivals else None,
+        rival=None if other is None else _by_score(site, finding_of(site, other), other),
         step=best.step,
         words=error_in_words(site, best),
     )

@@ -253,7 +253,8 @@ class OnlineScore:
         finding = finding_of(self.targets.site, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
         spread = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
-        rival = self._correction_of(score, rivals[0], []) if rivals else None
+        other = next((one for one in rivals if one.code != CHANGED), None)
+        rival = None if other is None else self._correction_of(score, other, [])
         return correction._replace(step_spread=spread, rival=rival)
 
     def open_rivals(self, correction: Correction) -> list[Rival]:
