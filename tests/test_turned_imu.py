@@ -37,8 +37,8 @@ def test_its_spread_has_the_motion_of_the_body_about_the_magnetometer() -> None:
     after, moved = turn.as_matrix() @ before, place + np.array([0.01, 0.0, -0.006])
     declared = mounted(demo_site(), before, place)
     (correction,) = corrections(declared, (), (), diagnosis(mounted(declared, after, moved)))
-    spread = correction.spread
-    assert spread is not None
+    (frame,) = correction.rivals
+    assert frame.is_frame
     # The magnetometer has one pose in the world; the body follows by either mounting.
     world_from_sensor, sensor_world = Rotation.random(random_state=rng).as_matrix(), np.ones(3)
     poses = []
@@ -47,7 +47,7 @@ def test_its_spread_has_the_motion_of_the_body_about_the_magnetometer() -> None:
         poses.append((world_from_body, sensor_world - world_from_body @ position))
     (one, at), (other, there) = poses
     step = np.concatenate([Rotation.from_matrix(other.T @ one).as_rotvec(), other.T @ (at - there)])
-    assert np.allclose(spread[0], 0.5 * np.outer(step, step), rtol=0.0, atol=1e-9)
+    assert np.allclose(frame.spread[0], 0.5 * np.outer(step, step), rtol=0.0, atol=1e-9)
 
 
 def test_either_frame_has_the_other_in_its_spread_by_their_odds() -> None:
@@ -67,8 +67,8 @@ def test_either_frame_has_the_other_in_its_spread_by_their_odds() -> None:
         (correction,) = corrections(declared, (), (), both)
         assert correction.rival is not None
         assert correction.rival.site is second.site
-        assert correction.spread is not None
-        spreads.append(correction.spread[0])
+        (frame,) = correction.rivals
+        spreads.append(frame.spread[0])
     for spread, odds in zip(spreads, (0.1, 0.9), strict=True):
         assert abs(np.sqrt(spread[2, 2]) - np.sqrt(odds) * np.pi / 2.0) < 1e-6  # rad
     # The lever arm turns about the magnetometer: by as much in either frame.
