@@ -65,8 +65,8 @@ def test_either_frame_has_the_other_in_its_spread_by_their_odds() -> None:
     for first, second, odds in ((known, other, 0.1), (other, known, 0.9)):
         both = first._replace(rival=second, rival_probability=odds)
         (correction,) = corrections(declared, (), (), both)
-        assert correction.rival is not None
-        assert correction.rival.site is second.site
+        assert correction.alternative is not None
+        assert correction.alternative.site is second.site
         (frame,) = correction.rivals
         spreads.append(frame.spread[0])
     for spread, odds in zip(spreads, (0.1, 0.9), strict=True):
@@ -80,7 +80,7 @@ def test_either_frame_has_the_other_in_its_spread_by_their_odds() -> None:
 def test_the_other_frame_is_tried_where_the_first_is_contradicted() -> None:
     text = Finding("mounting", "It is turned.")
     other = Correction(text, demo_site())
-    first = Correction(text, demo_site(), clear=True, rival=other)
+    first = Correction(text, demo_site(), clear=True, alternative=other)
     unrelated = Correction(Finding("lever_arm", "It is long."), demo_site())
 
     names = {id(first): "first", id(other): "other", id(unrelated): "unrelated"}

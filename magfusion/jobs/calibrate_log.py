@@ -93,6 +93,13 @@ class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
         " that predict beacons left out",
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.map_steel and self.cross_validate is not None:
+            raise InputError(
+                "--map-steel maps the whole log, of which --cross-validate compares parts; omit one"
+            )
+
 
 def run_calibrate_log(
     settings: LogCalibrationSettings, output: Path, report: Report = quiet

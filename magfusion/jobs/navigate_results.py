@@ -187,7 +187,7 @@ def navigated(
     states = current.states
     trust |= _without_levels(current.trust, navigator)
     estimates, refined = _calibration(navigator, log.name)
-    trust = _with_newest_values(trust, navigator.declared, refined)
+    trust = _with_newest_values(trust, navigator, refined)
     errors, compared = compared_with_truth(states, comparable(log, states, site))
     compared = axis_figures(states, errors, _frame(navigator)) | compared
     figures = heading("navigate", log.name) | trust_figures(trust)
@@ -217,16 +217,17 @@ def navigated(
     )
 
 
-def _with_newest_values(trust: Trust, declared: Site, refined: Site) -> Trust:
-    """Return findings whose remedies have the newest estimates in the place of the first ones."""
-    newest = changed_keys(declared, refined)
-    findings = tuple(
-        replace(f, remedy={key: newest.get(key, value) for key, value in f.remedy.items()})
-        if f.remedy
-        else f
-        for f in trust.findings
-    )
-    return replace(trust, findings=findings)
+def _with_newest_values(trust: Trust, navigator: Navigator, refined: Site) -> Trust:
+    """Return findings on what is corrected with the newest estimates as their remedies."""
+    newest = changed_keys(navigator.declared, refined)
+    corrected = {finding.code for finding in navigator.corrected}
+
+    def renewed(finding: Finding) -> Finding:
+        if not finding.remedy or finding.code not in corrected:
+            return finding
+        return replace(finding, remedy={k: newest.get(k, v) for k, v in finding.remedy.items()})
+
+    return replace(trust, findings=tuple(map(renewed, trust.findings)))
 
 
 def _calibration(navigator: Navigator, name: str) -> tuple[list[ParameterEstimate], Site]:

@@ -32,7 +32,7 @@ from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section
 from magfusion.results.provenance import versions
 
-_MOVED = "it is explained better without the map of the logs before it"
+_MOVED = "it is explained better without the map of the site or of the logs before it"
 _Steel = dict[str, SteelField | None]  # of each beacon
 
 
@@ -54,7 +54,8 @@ class SteelOfLogs:
     def trust(self) -> Trust:
         """What is mapped, and the logs that contradict the map of others."""
         used = [row for row in self.rows if row["used"] == "yes"]
-        text = "The steel is not mapped: in no log a map predicts beacons that it does not know."
+        reasons = "; ".join(dict.fromkeys(row["reason"] for row in self.rows))
+        text = f"The steel is not mapped: {reasons}."
         if used:
             shares = ", ".join(f"{100.0 * r['error_ratio']:.3g} % ({r['log']})" for r in used)
             text = (
@@ -65,8 +66,9 @@ class SteelOfLogs:
         for row in self.rows:
             if row["reason"] == _MOVED:
                 text = (
-                    f"Log {row['log']} contradicts the map of steel of the logs before it: steel"
-                    " was moved between them. Calibrate the logs before and after separately."
+                    f"Log {row['log']} contradicts the map of steel that the site or the logs"
+                    " before it have: steel was moved. Calibrate the logs before and after"
+                    " separately."
                 )
                 findings.append(Finding(MOVED.code, text, Verdict.DOUBTFUL))
         return Trust(tuple(findings))

@@ -63,6 +63,19 @@ def with_gravity(site: Site, gravity: float) -> Site:
     return replace(site, gravity=max(gravity, NO_GRAVITY))
 
 
+def turned_survey(site: Site, turn: Array, stretch: float = 1.0) -> Site:
+    """Return a site whose beacons are turned together (3, 3), their positions stretched."""
+    beacons = (
+        replace(
+            beacon,
+            position_world=stretch * turn @ beacon.position_world,
+            world_from_beacon=turn @ beacon.world_from_beacon,
+        )
+        for beacon in site.beacons
+    )
+    return replace(site, beacons=tuple(beacons))
+
+
 # Those of the inertial sensors, which no estimated parameter describes.
 _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
     # The states estimate them: their sigmas are too small.
@@ -83,29 +96,20 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
 
     `step` (h,): of all fixed parameters, in typical errors.
     """
-    if (
-        fault.code == SAMPLE_RATE
-    ):  # what drives drift alike is the clock that they are compared with
+    if fault.code == SAMPLE_RATE:
+        # What all drives drift by alike is the clock that they are compared with.
         (block, *_) = fault.blocks
         faster = float((block.sigma * step[block.columns])[0])
         rate = (1.0 + site.platform.magnetometer.clock_rate) * (1.0 + faster) - 1.0
         return with_magnetometer(site, clock_rate=rate)
     if fault.code in (TILT, STRETCH):
         size = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
-        turn = stretch = EYE
+        turn, stretch = EYE, 1.0
         if fault.code == TILT:
             turn = Rotation.from_rotvec(TYPICAL_TILT * np.append(size, 0.0)).as_matrix()
         else:
-            stretch = (1.0 + PER_CENT * float(size[0])) * EYE
-        beacons = tuple(
-            replace(
-                beacon,
-                position_world=turn @ stretch @ beacon.position_world,
-                world_from_beacon=turn @ beacon.world_from_beacon,
-            )
-            for beacon in site.beacons
-        )
-        return replace(site, beacons=beacons)
+            stretch = 1.0 + PER_CENT * float(size[0])
+        return turned_survey(site, turn, stretch)
     for block in fault.blocks:
         site = _moved(site, block, block.sigma * step[block.columns])
     return site

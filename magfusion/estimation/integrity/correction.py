@@ -49,6 +49,11 @@ class Rival(NamedTuple):
     spread: Array  # (states or 1, 6, 6), covariance of the poses by it
     is_frame: bool = False  # whether only the frame of the result differs, and the lever arm
 
+    @property
+    def key(self) -> str:
+        """A name of its own: a lever arm may be a rival as the other frame, and as such."""
+        return f"{self.name} (frame)" if self.is_frame else self.name
+
 
 class Correction(NamedTuple):
     """A mistake that explains a log."""
@@ -62,12 +67,12 @@ class Correction(NamedTuple):
     # whether they estimate values of parameters, and do not choose among usual mistakes
     is_estimate: bool = False
     # what is tried instead where the corrected result is contradicted
-    rival: "Correction | None" = None
+    alternative: "Correction | None" = None
     # (h,), by which the score moves the fixed parameters, in typical errors
     step: Array | None = None
     words: str = ""  # by how much they are wrong, as in the finding
     released: tuple[Block, ...] = ()  # parameters that the corrected solution estimates
-    is_rival: bool = False  # whether it takes the place of one that was contradicted
+    is_alternative: bool = False  # whether it takes the place of one that was contradicted
 
     @property
     def is_estimated(self) -> bool:
@@ -124,7 +129,7 @@ def _by_score(
         finding,
         corrected_site(site, best.fault, best.step),
         best.fault,
-        rival=None if other is None else _by_score(site, finding_of(site, other), other),
+        alternative=None if other is None else _by_score(site, finding_of(site, other), other),
         step=best.step,
         words=error_in_words(site, best),
     )
@@ -150,7 +155,9 @@ def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
     if other is None or other.site is None:
         return known
     # It is tried only where the first is contradicted: its frame is no longer in question.
-    return known._replace(rival=known._replace(finding=other.finding, site=other.site, rivals=()))
+    return known._replace(
+        alternative=known._replace(finding=other.finding, site=other.site, rivals=())
+    )
 
 
 def best_trial(
@@ -177,7 +184,7 @@ def best_trial(
         if remainder is not None:
             further: Correction | None = remainder._replace(finding=_refined(correction))
         else:
-            further = None if explains_all else correction.rival
+            further = None if explains_all else correction.alternative
         if further is not None:
             # By the score a rival is as likely as what the snapshots suggest, and less clear.
             is_rest = remainder is not None or correction.fault is None

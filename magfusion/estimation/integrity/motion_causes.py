@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.corrected_site import (
+    turned_survey,
     with_gravity,
     with_imu,
     with_intrinsics,
@@ -169,14 +170,6 @@ def _upside_down(known: Compared, before: float, site: Site) -> Explanation:
     turn, earth = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), None
     if site.earth_field_world is not None:
         earth = turn @ site.earth_field_world
-    beacons = (
-        replace(
-            beacon,
-            position_world=turn @ beacon.position_world,
-            world_from_beacon=turn @ beacon.world_from_beacon,
-        )
-        for beacon in site.beacons
-    )
     return Explanation(
         "survey_axes",
         "the survey's axes are north, east, down",
@@ -184,7 +177,7 @@ def _upside_down(known: Compared, before: float, site: Site) -> Explanation:
         before,
         after,
         known.freedom,
-        site=replace(site, beacons=tuple(beacons), earth_field_world=earth),
+        site=replace(turned_survey(site, turn), earth_field_world=earth),
     )
 
 

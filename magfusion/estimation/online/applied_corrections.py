@@ -25,7 +25,7 @@ class AppliedCorrections:
     """What is undone, how uncertain that leaves the states, and when the next may be tried.
 
     `findings`: one a mistake, with its remedy. `content`: of the corrected site's file, as JSON.
-    `last`: the last correction; its rival is tried first where the corrected states are
+    `last`: the last correction; its alternative is tried first where the corrected states are
     contradicted. A checkpoint has none.
     """
 
@@ -43,10 +43,10 @@ class AppliedCorrections:
         self._next, self._wait = -np.inf, KEPT
 
     def offered(self, possible: tuple[Correction, ...]) -> tuple[Correction, ...]:
-        """Return what may be tried, the most likely first: before all others the rival."""
-        if self.last is None or self.last.rival is None:
+        """Return what may be tried, the most likely first: before all others the alternative."""
+        if self.last is None or self.last.alternative is None:
             return possible
-        return self.last.rival._replace(is_rival=True), *possible
+        return self.last.alternative._replace(is_alternative=True), *possible
 
     def due(self, now: float) -> bool:
         """Return whether another correction may be tried at a time (s), and note that it is."""
@@ -61,8 +61,8 @@ class AppliedCorrections:
         """Return these with one more; parameters as of `corrected_finding`."""
         result = AppliedCorrections()
         finding = corrected_finding(correction, declared, reasons)
-        known = self.findings[:-1]  # a rival takes the place of the last one
-        if not correction.is_rival:
+        known = self.findings[:-1]  # an alternative takes the place of the last one
+        if not correction.is_alternative:
             known = tuple(f for f in self.findings if f.code != finding.code)
             earlier = next((f for f in self.findings if f.code == finding.code), finding)
             finding = replace(finding, text=earlier.text)  # that of a step has only the remainder
@@ -75,15 +75,15 @@ class AppliedCorrections:
     def widen(self, spread: Array) -> None:
         """Take over the covariance of a pose by the uncertainty of the last one, shape (6, 6)."""
         assert self.last is not None
-        rivals = {rival.name: _size(rival.spread[-1]) for rival in self.last.rivals}
+        rivals = {rival.key: _size(rival.spread[-1]) for rival in self.last.rivals}
         self._spread[self.findings[-1].code] = {"": _size(spread)} | rivals
 
-    def test_rivals(self, score: OnlineScore) -> None:
+    def drop_refuted(self, score: OnlineScore) -> None:
         """Drop the uncertainty by rivals of the last correction that later data refute."""
         own = self._spread.get(self.findings[-1].code, {}) if self.findings else {}
         if self.last is None or len(own) < 2:
             return
-        remaining = {"", *(rival.name for rival in score.open_rivals(self.last))}
+        remaining = {"", *(rival.key for rival in score.open_rivals(self.last))}
         self._spread[self.findings[-1].code] = {k: v for k, v in own.items() if k in remaining}
 
     def doubted(self, judgement: Judgement) -> Judgement:

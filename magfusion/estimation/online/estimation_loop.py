@@ -134,7 +134,7 @@ class EstimationLoop:
         score = self.running.update.score
         if score.correction is not None or score.is_steel:
             self.possible = () if score.correction is None else (score.correction,)
-        self.corrections.test_rivals(score)
+        self.corrections.drop_refuted(score)
         state: State = estimator.state
         reports, counts = self.reports, self.counts
         restarts = counts["lost and found again"]

@@ -372,7 +372,10 @@ class Navigator:
         """Return what a start on the newest input shows to be wrong with the site."""
         again = Navigator(self.site, self.settings)
         again._loop.search.wait_for(self._history.span)
-        self._history.replay(again)
+        try:
+            self._history.replay(again)
+        except (RuntimeError, InputError, np.linalg.LinAlgError):
+            return ()  # that is no reason to end
         return again._loop.possible
 
     def with_correction(self, correction: Correction) -> "Navigator":

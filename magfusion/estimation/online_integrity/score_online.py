@@ -254,8 +254,8 @@ class OnlineScore:
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
         spread = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
         other = next((one for one in rivals if one.code != CHANGED), None)
-        rival = None if other is None else self._correction_of(score, other, [])
-        return correction._replace(step_spread=spread, rival=rival)
+        instead = None if other is None else self._correction_of(score, other, [])
+        return correction._replace(step_spread=spread, alternative=instead)
 
     def open_rivals(self, correction: Correction) -> list[Rival]:
         """Return the rivals of a correction that the data do not refute up to the last result."""
