@@ -16,7 +16,7 @@ from magfusion.estimation.measurements.aiding_samples import aiding_measurement
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.estimation.online_integrity.judgement import Judgement
-from magfusion.estimation.online_integrity.score_epochs import Sums
+from magfusion.estimation.online_integrity.score_epochs import Sums, new_sums
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.aiding import AidingSamples
@@ -109,7 +109,7 @@ def _scored(*, used: bool, rejected: bool) -> Sums:
     site = aided_site(WHEELS)
     score = OnlineScore(site, (), (), steady=False)
     size, cov = len(score.targets.unit), np.diag(np.repeat([0.02, 0.05, 0.05, 0.02, 0.002], 3) ** 2)
-    score._sums = Sums(np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size)), 0.0)
+    score._sums = new_sums(np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size)), 0.0)
     velocity = np.array([1.0, 0.0, 0.0])
     rest = np.zeros(3), np.zeros(3), initial_calibration(site, 0.0), cov
     states = [State(t, np.eye(3), t * velocity, velocity, *rest) for t in (0.0, 0.1)]
@@ -121,7 +121,7 @@ def _scored(*, used: bool, rejected: bool) -> Sums:
     sums = score.settle()
     assert sums is not None
     own = slice(size)  # without steps of the biases
-    return Sums(sums.information[own, own], sums.gradient[own], sums.response[:, own], sums.time)
+    return new_sums(sums.information[own, own], sums.gradient[own], sums.response[:, own], 0.0)
 
 
 def test_rejected_samples_are_scored_without_a_gain() -> None:

@@ -73,7 +73,7 @@ ROOMS = {
             aiding inertial rotor rotor_beacons steel
             disturbance rails
             drift field steel_worlds wells
-            waveform
+            events waveform
             config
             log
             endurance
@@ -119,10 +119,10 @@ ROOMS = {
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             budget_figures settings without_beacons
             coil typer_options
-            coil_drive
+            coil_drive drift_conditions
             accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer calibrate_response check design_settings drift_world drive
-            evaluate export import_figures init_settings
+            drift_events evaluate export import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
             sheet simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions

@@ -13,16 +13,23 @@ from typing import TYPE_CHECKING, Literal
 from magfusion.errors import InputError
 from magfusion.files.atomic import real
 from magfusion.files.checkpoint import read_position
+from magfusion.jobs.drift_conditions import Condition
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.drift import QUANTITIES, EstimatorPlot, Verdict, settled_after, worlds_text
+from magfusion.results.drift import (
+    QUANTITIES,
+    Criterion,
+    EstimatorPlot,
+    Verdict,
+    settled_after,
+    worlds_text,
+)
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.simulation.monte_carlo import run_many
 
 if TYPE_CHECKING:
-    from magfusion.jobs.drift_figures import Criterion
     from magfusion.jobs.drift_world import Estimator, WorldRun, WorldTask
 
 
@@ -46,6 +53,11 @@ class DriftSettings(RandomSettings):
         words={"both": ESTIMATORS, "ekf": ("ekf",), "smoother": ("smoother",)},
     )
     worlds: int = option(1, "Independent worlds", least=1, most=10_000, note="8 for a firm verdict")
+    condition: Condition = option(
+        "usual",
+        "What happens: a day's temperature cycle, mains that wander, a beacon exchanged at noon, or"
+        " beacons that sink by 1 mm a day, one or all, seen by a static platform",
+    )
     drive: Literal["current", "voltage"] = option(
         "current", "A voltage drives less current through warm coils"
     )
@@ -78,6 +90,7 @@ class DriftSettings(RandomSettings):
                 estimator=estimator,
                 hours=self.hours,
                 seed=self.seed,
+                condition=self.condition,
                 drive=self.drive,
                 phase_known=self.phase_known,
                 clock_rate=1e-6 * self.clock_ppm,
@@ -169,6 +182,7 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
         Figure("hours", settings.hours),
         Figure("worlds", settings.worlds),
         Figure("seed", settings.seed),
+        Figure("condition", settings.condition),
         Figure("drive", settings.drive),
         Figure("phase", "known" if settings.phase_known else "free"),
         Figure("clock_ppm", settings.clock_ppm, "ppm"),

@@ -1,11 +1,12 @@
 """Figures of an estimator's runs, with a verdict and its sentence for each criterion."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2, ttest_ind
 
+from magfusion.jobs.drift_events import judge_events
 from magfusion.jobs.drift_world import PACE, PIECE, STRETCH, WorldRun
 from magfusion.results.drift import (
     CERTAIN,
@@ -13,6 +14,7 @@ from magfusion.results.drift import (
     MIN_COMMON,
     QUANTITIES,
     THREE_SIGMA,
+    Criterion,
     ErrorSeries,
     Quantity,
     Slope,
@@ -46,15 +48,6 @@ CLAIMED = 2.5
 _STARTED = 60.0  # s
 
 
-@dataclass(frozen=True)
-class Criterion:
-    """One criterion and its verdict."""
-
-    name: str  # of its verdict in the report
-    verdict: Verdict
-    sentence: str
-
-
 STABILITY = {"pass": "stable", "fail": "unstable", "undecided": "inconclusive"}
 
 
@@ -65,7 +58,15 @@ def judge_runs(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Criterion
     """
     figures: list[Figure] = []
     judgements: list[Criterion] = []
-    for part in (_drifts, _propagation_figures, _consistency, _memory, _latency, _losses):
+    for part in (
+        _drifts,
+        _propagation_figures,
+        _consistency,
+        _memory,
+        _latency,
+        _losses,
+        judge_events,
+    ):
         result, own = part(runs)
         figures += result
         judgements += own

@@ -18,33 +18,28 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.graph.preintegration import preintegration_parameters
 from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, State
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import RowFile, RowPosition, claim_rows
 from magfusion.jobs.checkpoint import CheckpointWriter, begin
+from magfusion.jobs.drift_conditions import Condition, declared_site, endurance_config
 from magfusion.model.samples import ImuSamples
-from magfusion.model.site import ImuModel, Site
+from magfusion.model.site import ImuModel
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.drift import ErrorSeries
-from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import (
     Biases,
     EnduranceConfig,
     EnduranceWorld,
     SimulatedStretch,
     draw_endurance,
-    usual_drift,
 )
-from magfusion.simulation.inertial import BiasInstability
-from magfusion.units import HOUR, Array, BoolArray
+from magfusion.units import Array, BoolArray
 
 STRETCH = 10  # blocks that are made, navigated and written at once
 PIECE = 10.0  # s that are fed at once
 BARE = 6000  # samples of each stretch on which the bare loop is timed
-# A good MEMS, in addition to the walk declared in the site.
-INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
-# Declared moment uncertainty (log) of such a drive: heating and drift.
-MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
 Estimator = Literal["ekf", "smoother"]
 PACE = ("time", "seconds", "updates", "memory_mib", "distortion", "bare_sample_seconds")
 _ERRORS = {"time": 1, "measured": 1, "error": 15, "sigma": 15, "pose_nees": 1, "bias_nees": 1}
@@ -64,6 +59,7 @@ class WorldTask:
     # whether the drives are declared synchronised; otherwise each beacon has a clock of its own
     phase_known: bool = False
     clock_rate: float = 0.0  # relative error of the clock that all drives share
+    condition: Condition = "usual"
     place: str | None = None  # directory of the files needed to resume; None stores nothing
 
     @property
@@ -83,6 +79,16 @@ class WorldTask:
         return -(-EnduranceConfig(self.hours).blocks // STRETCH)
 
 
+@dataclass(frozen=True)
+class Reported:
+    """The first finding of a code about the same beacons."""
+
+    code: str
+    beacons: tuple[str, ...]
+    time: float  # s
+    text: str
+
+
 @dataclass(frozen=True, eq=False)
 class WorldRun:
     """Result of a run."""
@@ -96,6 +102,8 @@ class WorldRun:
     # processor time of a bare loop over ``integrateMeasurement`` on all samples, extrapolated
     bare_seconds: float
     losses: dict[str, int]  # counts of refused, lost and recovered epochs
+    reported: tuple[Reported, ...] = ()
+    event_beacon: str = ""  # that settles or is exchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,38 +114,13 @@ class _Progress:
     bare: float
     errors: RowPosition | None = None
     pace: RowPosition | None = None
-
-
-def declared_site(drive: str, phase_known: bool) -> Site:
-    """Return the site as its user declares it: only the drifts of these worlds.
-
-    A moment has the drift of its gain, and the fading of its coil, in an hour; the only error of
-    the field model is the scale that follows the magnetometer's temperature.
-    """
-    site, drift = demo_site(synchronised=phase_known), usual_drift(drive, 0.0)
-    assert drift.gain is not None
-    assert drift.coils is not None
-    assert drift.sensor is not None
-    wander = drift.gain.rms * np.sqrt(2.0 * HOUR / drift.gain.time_constant)
-    fading = drift.fading_per_kelvin * drift.coils.rise * np.sqrt(HOUR / drift.coils.time_constant)
-    beacons = tuple(
-        replace(b, sigma=replace(b.sigma, log_moment=np.full(len(b.coils), MOMENT_SIGMA[drive])))
-        for b in site.beacons
-    )
-    return replace(
-        site,
-        beacons=beacons,
-        model_error=drift.scale_per_kelvin * drift.sensor.amplitude,
-        clock=replace(site.clock, log_moment_walk=float(np.hypot(wander, fading))),
-    )
+    reported: tuple[Reported, ...] = ()
 
 
 def draw_task(task: WorldTask) -> EnduranceWorld:
     """Return the world of a task; it is the same for both estimators."""
-    config = EnduranceConfig(
-        hours=task.hours, drift=usual_drift(task.drive, task.clock_rate), instability=INSTABILITY
-    )
-    site = declared_site(task.drive, task.phase_known)
+    config = endurance_config(task.condition, task.hours, task.drive, task.clock_rate)
+    site = declared_site(task.condition, task.drive, task.phase_known)
     return draw_endurance(site, config, (task.seed, task.world))
 
 
@@ -159,19 +142,34 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
         for stretch in range(begun.position, task.stretches):
             built = world.stretch(stretch * STRETCH, STRETCH, progress.biases)
             sample = bare_loop(built.imu, world.site.platform.imu, world.site.gravity)
-            new, own_pace = navigate(navigator, world, built)
+            new, own_pace, states = navigate(navigator, world, built)
             errors.extend({name: getattr(new, name) for name in _ERRORS})
             own_pace = np.column_stack([own_pace, np.full(len(own_pace), sample)])
             pace.extend(dict(zip(PACE, own_pace.T, strict=True)))
             bare = progress.bare + sample * len(built.imu)
-            progress = _Progress(built.after, bare, errors.settle(), pace.settle())
+            reported = first_findings(states, progress.reported)
+            progress = _Progress(built.after, bare, errors.settle(), pace.settle(), reported)
             kept.save(navigator, stretch + 1, progress)
         series, every = _series(errors.rows()), np.column_stack(list(pace.rows().values()))
     if not navigator.started:
         raise EstimationError(
             f"world {task.world}: {task.hours:g} h give no state of the {task.estimator}"
         )
-    return WorldRun(task, series, every, progress.bare, navigator.losses)
+    event_beacon = world.site.beacons[world.events.beacon].name
+    known = progress.bare, navigator.losses, progress.reported, event_beacon
+    return WorldRun(task, series, every, *known)
+
+
+def first_findings(states: list[JudgedState], known: tuple[Reported, ...]) -> tuple[Reported, ...]:
+    """Return known findings and those that the states have for the first time."""
+    first = {(one.code, one.beacons): one for one in known}
+    for state in states:
+        names = [beacon.name for beacon in state.calibration.site.beacons]
+        for one in state.judgement.findings:
+            beacons = tuple(n for n in names if re.search(rf"[Bb]eacons? {n}\b", one.text))
+            new = Reported(one.code, beacons, state.time, one.text)
+            first.setdefault((one.code, beacons), new)
+    return tuple(first.values())
 
 
 def _series(rows: dict[str, Array]) -> ErrorSeries:
@@ -187,9 +185,10 @@ def _series(rows: dict[str, Array]) -> ErrorSeries:
 
 def navigate(
     navigator: Navigator, world: EnduranceWorld, simulation: SimulatedStretch
-) -> tuple[ErrorSeries, Array]:
-    """Process a stretch piece by piece; return the errors of its states and their pace."""
+) -> tuple[ErrorSeries, Array, list[JudgedState]]:
+    """Process a stretch piece by piece; return the errors of its states, their pace, and them."""
     states: list[State] = []
+    reported: list[JudgedState] = []
     pace = []
     # A field at its time, then the inertial samples up to the next one.
     grid = np.arange(simulation.imu.time[0], simulation.imu.time[-1], PIECE)
@@ -207,18 +206,18 @@ def navigate(
             simulation.imu.accel_body[rows],
         )
         # The estimator's own sigmas: those enlarged by its tests would hide a drift.
-        new = [replace(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
+        reported += navigator.take()
+        claimed = [replace(s, cov=s.judgement.estimators(s.cov)) for s in reported[len(states) :]]
         spent = time.process_time() - began
         navigator.take_lagged()
         level = list(navigator.distortion.values())
         innovation = float(np.mean(level)) if level else np.nan
-        pace.append([starts[i], spent, len(new), memory_mib(), innovation])
-        states += new
+        pace.append([starts[i], spent, len(claimed), memory_mib(), innovation])
+        states += claimed
     stamps = np.array([s.time for s in states])
     truth = world.truth(simulation, stamps)
-    return state_errors(
-        states, truth, np.asarray(np.isin(stamps, simulation.fields.time))
-    ), np.array(pace)
+    measured = np.asarray(np.isin(stamps, simulation.fields.time))
+    return state_errors(states, truth, measured), np.array(pace), reported
 
 
 def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:

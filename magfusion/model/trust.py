@@ -128,6 +128,7 @@ CODES = {
     "samples_lost": "samples are missing, one or a few at a time",
     "saturated": "samples are at a limit of the instrument's range",
     "separation": "excluding a beacon moves the pose by more than noise and survey explain",
+    "settlement": "a beacon moves steadily against the others, seen from a platform at rest",
     "sign_open": "amplitudes near zero, whose sign is not determined, were left out",
     "silent_beacon": "a beacon is not detected, at all or for a while",
     "site_changed": "a beacon was moved or exchanged between logs, or a platform changed",

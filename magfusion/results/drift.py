@@ -26,6 +26,15 @@ ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 Verdict = Literal["pass", "fail", "undecided"]
 
 
+@dataclass(frozen=True)
+class Criterion:
+    """One criterion and its verdict."""
+
+    name: str  # of its verdict in the report
+    verdict: Verdict
+    sentence: str
+
+
 @dataclass(frozen=True, eq=False)
 class ErrorSeries:
     """Errors of the states of one run."""

@@ -90,6 +90,7 @@ class Drift:
 
     # temperature of all coils and their amplifiers, which are driven equally
     coils: WarmUp | None = None
+    ambient: DailySwing | None = None  # temperature around them
     # the moment of a coil warmer by T kelvin is scaled by ``1 / (1 + fading T)``: for a constant
     # voltage `COPPER_PER_KELVIN`, for a constant current the loss of its source
     fading_per_kelvin: float = 0.0
@@ -121,9 +122,9 @@ def draw_drift(drift: Drift, time: Array, beacons: int, rng: np.random.Generator
     """
     gain_rng, clock_rng = rng.spawn(2)
     log_gain = np.zeros((len(time), beacons))
-    if drift.coils is not None:
-        warmer = drift.coils.temperature(time)
-        log_gain -= np.log1p(drift.fading_per_kelvin * warmer)[:, None]
+    for heat in (drift.coils, drift.ambient):
+        if heat is not None:
+            log_gain -= np.log1p(drift.fading_per_kelvin * heat.temperature(time))[:, None]
     if drift.gain is not None:
         log_gain += drift.gain.draw(time, beacons, gain_rng)
     scale = np.ones(len(time))

@@ -23,6 +23,7 @@ from magfusion.simulation.drift import (
     WarmUp,
     draw_drift,
 )
+from magfusion.simulation.events import DrawnEvents, Events, draw_events
 from magfusion.simulation.inertial import BiasInstability
 from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
 from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_motion
@@ -63,6 +64,7 @@ class EnduranceConfig:
     # of moments and sensor, and of the clock common to all drives; beacons that are not
     # synchronised also drift relative to it, each at a rate of its own
     drift: Drift = field(default_factory=lambda: usual_drift("current", 0.0))
+    events: Events = field(default_factory=Events)
     schedule: Rests = SCHEDULE  # walks, and the rests between them
     # (2, 3), range of the platform (m)
     box_world: Array = field(default_factory=lambda: DEMO_BOX_WORLD)
@@ -136,6 +138,7 @@ class EnduranceWorld:
     log_gain: Array  # (blocks + 1, beacons), of the moments, at the blocks' edges
     phase: Array  # (blocks + 1, channels), in addition to the declared (rad)
     scale: Array  # (blocks + 1,), of the magnetometer
+    events: DrawnEvents
     seed: tuple[int, ...]
 
     def start(self) -> Biases:
@@ -153,7 +156,7 @@ class EnduranceWorld:
         """
         count = min(count, self.config.blocks - first)
         inertial, fields = [], []
-        still: dict[int, ComplexArray] = {}
+        still: dict[tuple[int, float], ComplexArray] = {}
         for block in range(first, first + count):
             built = self._inertial(block, before)
             before = built[-1]
@@ -191,6 +194,7 @@ class EnduranceWorld:
         bias, after = _continued_biases(
             before, imu, self.config.instability, rate_hz, len(time), rng
         )
+        bias = bias + self.events.bias(time)
         white = np.sqrt(rate_hz) * rng.standard_normal((2, len(time), 3))
         gyro = ideal[0] + bias[0] + imu.gyro_noise * white[0]
         accel = ideal[1] + bias[1] + imu.accel_noise * white[1]
@@ -204,7 +208,7 @@ class EnduranceWorld:
             self.motion.specific_force_body(requested, self.true_site.gravity),
         )
 
-    def _fields(self, block: int, still: dict[int, ComplexArray]) -> FieldSamples:
+    def _fields(self, block: int, still: dict[tuple[int, float], ComplexArray]) -> FieldSamples:
         config, site = self.config, self.true_site
         time = self._field_times(block)
         rng = _generator(self.seed, _FIELDS, block)
@@ -215,7 +219,7 @@ class EnduranceWorld:
         )
         owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
         drive = scale * np.exp(log_gain[:, owner] + 1j * phase)
-        seen = drive[..., None] * self._undisturbed(time, still)
+        seen = drive[..., None] * self._undisturbed(time, still) + self._hum(time, site)
         sigma = config.noise.density(time) / np.sqrt(config.window)
         noise = sigma[:, None, None] * rng.standard_normal((2, *seen.shape))
         cov = sigma[:, None, None, None] ** 2 * np.eye(3)
@@ -227,22 +231,32 @@ class EnduranceWorld:
             phasor_cov=np.broadcast_to(cov, (*seen.shape, 3)).copy(),
         )
 
-    def _undisturbed(self, time: Array, still: dict[int, ComplexArray]) -> ComplexArray:
+    def _hum(self, time: Array, site: Site) -> ComplexArray:
+        hum_world = self.events.hum(time, site.tone_frequencies_hz, self.config.window)
+        sensor_from_body = site.platform.magnetometer.body_from_sensor.T
+        body_from_world = np.swapaxes(self.motion.trajectory(time).world_from_body, 1, 2)
+        sensor_from_world = sensor_from_body @ body_from_world
+        return np.asarray((sensor_from_world[:, None] @ hum_world[..., None])[..., 0])
+
+    def _undisturbed(
+        self, time: Array, still: dict[tuple[int, float], ComplexArray]
+    ) -> ComplexArray:
         """Return the phasors as declared; those of a rest are computed once, at its middle."""
         if np.any(self.config.active(time)):
-            return self._phasors(time)
+            return self._phasors(time, float(time[0]))
         rests = self.config.schedule
         cycle = rests.move + rests.pause
         rest = int(np.floor((time[0] - rests.start) / cycle))
-        if rest not in still:
+        key = rest, self.events.constant_since(float(time[0]))
+        if key not in still:
             middle = rests.start + rest * cycle + rests.move + 0.5 * rests.pause
-            still[rest] = self._phasors(np.array([max(middle, 0.0)]))
-        return np.repeat(still[rest], len(time), axis=0)
+            still[key] = self._phasors(np.array([max(middle, 0.0)]), float(time[0]))
+        return np.repeat(still[key], len(time), axis=0)
 
-    def _phasors(self, time: Array) -> ComplexArray:
-        poses = self.motion.trajectory(time)
+    def _phasors(self, time: Array, now: float) -> ComplexArray:
+        poses, site = self.motion.trajectory(time), self.events.site_at(self.true_site, now)
         rng = np.random.default_rng(0)  # of noise that is none
-        return simulate_fields(self.true_site, poses, 0.0, rng).phasor_sensor
+        return simulate_fields(site, poses, 0.0, rng).phasor_sensor
 
     def _field_times(self, block: int) -> Array:
         config = self.config
@@ -259,7 +273,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     `site`: known to the estimator; the true calibration is drawn from its sigmas. Raises InputError
     if the site or the configuration cannot be simulated.
     """
-    site_rng, motion_rng, drift_rng, clock_rng = _generator(seed, _WORLD, 0).spawn(4)
+    site_rng, motion_rng, drift_rng, clock_rng, event_rng = _generator(seed, _WORLD, 0).spawn(5)
     true_site = perturb_site(site, site_rng)
     motion = random_walk_motion(
         motion_rng, config.blocks * BLOCK, config.box_world, config.speed, rests=config.schedule
@@ -284,6 +298,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
         log_gain=drawn.log_gain,
         phase=drives.phase + 2.0 * np.pi * lead * tones_hz,
         scale=drawn.sensor_scale,
+        events=draw_events(config.events, true_site, edges, event_rng),
         seed=seed,
     )
 

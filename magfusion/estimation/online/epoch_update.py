@@ -34,6 +34,7 @@ from magfusion.estimation.online_integrity.near_metal import NearMetal
 from magfusion.estimation.online_integrity.online import EpochSummary, OnlineMonitor
 from magfusion.estimation.online_integrity.open_roll import roll_findings
 from magfusion.estimation.online_integrity.score_online import OnlineScore
+from magfusion.estimation.online_integrity.settlement import SettlementTest
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -63,6 +64,7 @@ class EpochUpdate:
     aiding: AidingGate
     monitor: OnlineMonitor
     score: OnlineScore
+    settlement: SettlementTest
     metal: NearMetal
     _dead_reckoning: DeadReckoningCheck
     recovery: LossRecovery
@@ -87,6 +89,7 @@ class EpochUpdate:
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
         self.monitor = OnlineMonitor(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
+        self.settlement = SettlementTest(site)
         self.recovery = LossRecovery(self.gate, blocks, lost_beyond)
         self._comparison = FixComparison()
         self._earth = EarthWeight(blocks) if earth else None
@@ -147,7 +150,8 @@ class EpochUpdate:
         linear = predicted if absorbed and point is None else None
         self._separate(linear, measurements, estimator.state)
         self._update_monitor(before, predicted, estimator.state, result)
-        if result is not None and result.is_sequential:
+        if result is not None and isinstance(result.phasors, FieldPhasors):
+            self.settlement.update(result.phasors, result.samples, estimator.state)
             self._compare(result.samples, estimator.state)
         verdicts = self._judge_state(estimator.state, self._lost_since(estimator.state))
         return verdicts if result is None else replace(verdicts, detected=result.detected)
@@ -240,6 +244,7 @@ class EpochUpdate:
             *self.metal.judgement().findings,
             *self.of_currents,
             *self.gate.watch.findings(),
+            *self.settlement.findings(),
             *_of_place(self.site, state),
             *self._roll,
         )

@@ -33,6 +33,7 @@ from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.levels import Levels
 from magfusion.estimation.online_integrity.score_epochs import Sums
+from magfusion.estimation.online_integrity.settlement import Rest
 from magfusion.files.plain_data import Rules, from_plain, to_plain
 from magfusion.files.plausible import beyond_range
 from magfusion.model.parameters import Block, Calibration, dimension, initial_calibration
@@ -98,6 +99,7 @@ def navigator_rules(
             Judgement: _check_judgement,
             DecayingSums: _check_running,
             Sums: _check_sums,
+            Rest: lambda rest: rest.check(site),
             SubsetBank: lambda bank: bank.check(size),
             Node: lambda node: _check_node(node, blocks),
             WindowPrior: lambda prior: _check_prior(prior, size),

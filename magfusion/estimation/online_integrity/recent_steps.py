@@ -62,12 +62,14 @@ class RecentSteps:
         size = len(self._rows)
         response = np.zeros((len(sums.response), size))
         response[self._rows, np.arange(size)] = -self._unit
-        new = Sums(
-            np.pad(sums.information, (0, size)),
-            np.pad(sums.gradient, (0, size)),
-            np.concatenate([sums.response, response], axis=1),
-            sums.time,
-            (*sums.onsets, sums.time),
+        new = replace(
+            sums,
+            information=np.pad(sums.information, (0, size)),
+            gradient=np.pad(sums.gradient, (0, size)),
+            response=np.concatenate([sums.response, response], axis=1),
+            cross_cov=np.pad(sums.cross_cov, ((0, 0), (0, size))),
+            excess=np.pad(sums.excess, (0, size)),
+            onsets=(*sums.onsets, sums.time),
         )
         return new if len(new.onsets) <= MOST_ONSETS else self._without_one(new)
 
@@ -82,6 +84,8 @@ class RecentSteps:
             information=sums.information[np.ix_(kept, kept)],
             gradient=sums.gradient[kept],
             response=sums.response[:, kept],
+            cross_cov=sums.cross_cov[:, kept],
+            excess=sums.excess[np.ix_(kept, kept)],
             onsets=sums.onsets[:dropped] + sums.onsets[dropped + 1 :],
         )
 

@@ -24,20 +24,40 @@ from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray
 
 MEMORY = 60.0  # s; older innovations count less, as faults may change
+ROUNDING = 1e-10  # of a covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Sums:
     """Sums over the innovations up to now, in typical errors of the fixed parameters.
 
-    After these h parameters follow those of `magfusion.estimation.online_integrity.beacon_steps`.
+    After these h parameters follow those of `magfusion.estimation.online_integrity.recent_steps`.
+    A filter whose gain considers uncertain parameters leaves errors in the state that appear in
+    successive innovations: they are correlated, given the parameters, and the gradient varies more
+    than its information.
     """
 
     information: Array  # (h + k, h + k)
     gradient: Array  # (h + k,)
     response: Array  # (15 + estimated, h + k), effect of a unit error of these on the state
     time: float  # (s)
+    cross_cov: Array  # (15 + estimated, h + k), covariance of the state's error with the gradient
+    excess: Array  # (h + k, h + k), covariance of the gradient beyond the information
     onsets: tuple[float, ...] = ()  # times of the tested steps (s)
+
+    def with_correlation(self, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """Return information and gradient, (h + k, h + k) and (h + k,), as the noise allows.
+
+        The gradient is a measurement of the errors, ``information @ errors``; its covariance is the
+        information and the excess.
+        """
+        value, vector = np.linalg.eigh(0.5 * (self.excess + self.excess.T))
+        cov = information + (vector * np.maximum(value, 0.0)) @ vector.T
+        value, vector = np.linalg.eigh(cov)
+        known = value > ROUNDING * value[-1]
+        by = (vector[:, known] / np.sqrt(value[known])).T
+        whitened = by @ information
+        return whitened.T @ whitened, whitened.T @ (by @ gradient)
 
 
 class EpochTransition(NamedTuple):
@@ -104,13 +124,59 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
     whole = np.einsum("k,kij->ij", kept[1:], reported)
-    return Sums(
-        kept[0] * sums.information + whole[:, :-1],
-        kept[0] * sums.gradient + whole[:, -1],
-        response,
-        float(time[-1]),
-        sums.onsets,
+    cross_cov, excess = _correlation(
+        sums, epochs, by_own, alone, gain, shown, solved[..., :-1], kept
     )
+    return replace(
+        sums,
+        information=kept[0] * sums.information + whole[:, :-1],
+        gradient=kept[0] * sums.gradient + whole[:, -1],
+        response=response,
+        time=float(time[-1]),
+        cross_cov=cross_cov,
+        excess=excess,
+    )
+
+
+def _correlation(
+    sums: Sums,
+    epochs: Sequence[Epoch],
+    jacobian: Array,
+    cov: Array,
+    gain: Array,
+    shown: Array,
+    weight: Array,
+    kept: Array,
+) -> tuple[Array, Array]:
+    """Return `Sums.cross_cov` and `Sums.excess` after some epochs.
+
+    Parameters
+    ----------
+    jacobian, cov, gain : ndarray
+        (epochs, m, n), (epochs, n, n), (epochs, n, m), of the rows by the state, of the state given
+        the parameters, and of the update.
+    shown, weight : ndarray, shape (epochs, m, h + k)
+        What a unit error shows in the innovations, and the same times their inverse covariance.
+    kept : ndarray, shape (epochs + 1,)
+        Weight of the sums before, and of each epoch.
+    """
+    own, size = slice(0, cov.shape[1]), shown.shape[2]
+    cross_cov, appears = sums.cross_cov, np.empty_like(shown)
+    for k, epoch in enumerate(epochs):
+        cross_cov = kept[k] / kept[k + 1] * cross_cov
+        if epoch.passed is not None:
+            cross_cov = epoch.passed.transition[own, own] @ cross_cov
+        appears[k] = jacobian[k] @ cross_cov
+        cross_cov = cross_cov + cov[k] @ (jacobian[k].T @ weight[k])
+        cross_cov = cross_cov - gain[k] @ (appears[k] + shown[k])
+    both = (kept[1:, None, None] * weight).reshape(-1, size).T @ appears.reshape(-1, size)
+    return cross_cov, kept[0] * sums.excess + both + both.T
+
+
+def new_sums(information: Array, gradient: Array, response: Array, time: float) -> Sums:
+    """Return sums of innovations that are not correlated with the state's error."""
+    none = np.zeros_like(response), np.zeros_like(information)
+    return Sums(information, gradient, response, time, *none)
 
 
 def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:

@@ -8,6 +8,7 @@ for one more matrix product.  Epochs are pending until a result is requested.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from magfusion.estimation.online_integrity.score_epochs import (
     Epoch,
     Sums,
     add_epochs,
+    new_sums,
     passed,
 )
 from magfusion.estimation.online_integrity.score_targets import (
@@ -81,7 +83,8 @@ class OnlineScore:
         self._sums, self._scored_at, self._judgement = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
         self._epochs_since_score = 0
-        self._evidence: tuple[Array, Array] | None = None  # of the last result
+        self._result: tuple[Sums, Score] | None = None  # the last
+        self._evidence: tuple[Array, Array] | None = None  # of it, once requested
         self._detected_at = {}
         self.correction: Correction | None = None
         self.named = ()
@@ -118,7 +121,8 @@ class OnlineScore:
         if not shared or not targets.fixed_blocks:
             return
         response = -np.concatenate([score.by_state[-1], score.by_calibration])
-        self._sums, self._waiting = Sums(score.information, score.gradient, response, time), []
+        self._sums = new_sums(score.information, score.gradient, response, time)
+        self._waiting = []
 
     def end(self) -> None:
         """Stop the test: the state was replaced, and its response is not known.
@@ -160,7 +164,10 @@ class OnlineScore:
         gradient, response = information[0].copy(), np.zeros((targets.size, len(targets.unit)))
         information[np.ix_(here, here)] = sums.information[np.ix_(there, there)]
         gradient[here], response[:, here] = sums.gradient[there], sums.response[:, there]
-        self._sums = Sums(information, gradient, response, sums.time)
+        own = np.ix_(here, here), np.ix_(there, there)
+        self._sums = new_sums(information, gradient, response, sums.time)
+        self._sums.excess[own[0]] = sums.excess[own[1]]
+        self._sums.cross_cov[:, here] = sums.cross_cov[:, there]
 
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
         """Propagate the response to a prediction.
@@ -231,8 +238,11 @@ class OnlineScore:
             fixed = [one._replace(combine=np.pad(one.combine, more)) for one in known]
             return [*fixed, *self._steps.candidates(steps, information, gradient)]
 
-        self._evidence = score.with_declared(tolerance=False)
+        self._result, self._evidence = (sums, score), None
         causes = list(causes_of(pose_cov, score, candidates))
+        if causes:
+            score = _correlated(sums, score)
+            causes = list(causes_of(pose_cov, score, candidates))
         self.correction, self.named = None, ()
         if targets.steel and (bent := self._steel_of(score, causes)) is not None:
             return bent
@@ -259,8 +269,10 @@ class OnlineScore:
 
     def open_rivals(self, correction: Correction) -> list[Rival]:
         """Return the rivals of a correction that the data do not refute up to the last result."""
-        if self._evidence is None:
+        if self._result is None:
             return list(correction.rivals)
+        if self._evidence is None:
+            self._evidence = _correlated(*self._result).with_declared(tolerance=False)
         return open_rivals(correction, self.targets.fault_candidates, *self._evidence)
 
     def _steel_of(self, score: Score, named: Sequence[NamedCause]) -> Judgement | None:
@@ -275,3 +287,9 @@ class OnlineScore:
         ]
         turn, shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
         return Judgement((estimate.finding(self.site),), turn=turn, shift=shift)
+
+
+def _correlated(sums: Sums, score: Score) -> Score:
+    """Return a score as the correlation of the innovations allows."""
+    information, gradient = sums.with_correlation(score.information, score.gradient)
+    return replace(score, information=information, gradient=gradient)

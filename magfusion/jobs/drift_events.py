@@ -1,0 +1,89 @@
+"""Whether the estimators report what happens to the beacons in a drift test, and nothing else."""
+
+from typing import NamedTuple
+
+from magfusion.estimation.online_integrity.settlement import SETTLEMENT
+from magfusion.jobs.drift_conditions import endurance_config
+from magfusion.jobs.drift_world import Reported, WorldRun, WorldTask
+from magfusion.results.drift import Criterion, Verdict
+from magfusion.results.figures import Figure
+from magfusion.units import HOUR
+
+
+class Event(NamedTuple):
+    """What happens to one beacon."""
+
+    begin: float  # s
+    within: float  # in which it is to be reported (s)
+    what: str
+
+
+def event_of(task: WorldTask) -> Event | None:
+    """Return what happens to one beacon in a world, if anything does."""
+    events = endurance_config(task.condition, task.hours, task.drive, task.clock_rate).events
+    if events.exchange is not None:
+        return Event(events.exchange.time, HOUR, "the exchange")
+    if events.settlement is not None and not events.settlement.whole:
+        return Event(0.0, 24.0 * HOUR, "the settlement")
+    return None
+
+
+def judge_events(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
+    """Return what was reported, and the judgement of it."""
+    event = event_of(runs[0].task)
+    is_settlement = event is not None and event.begin == 0.0
+    named = [f for run in runs for f in run.reported if f.code == SETTLEMENT]
+    right = [run.event_beacon for run in runs if is_settlement]
+    false = [f for run in runs for f in run.reported if _is_false(f, run, is_settlement)]
+    lines = [f"{f.time / HOUR:.2f} h: {f.code}: {f.text}" for run in runs for f in run.reported]
+    figures = [Figure("reported", lines), Figure("false_settlements", len(false))]
+    criteria = []
+    if runs[0].task.condition == "common-settlement" or named or right:
+        criteria.append(_of_false(false, runs[0].task.condition))
+    if event is not None:
+        after = [_delay(run, event) for run in runs]
+        hours = ["never" if t is None else f"{t / HOUR:.2f}" for t in after]
+        figures.append(Figure("reported_after_h", hours))
+        criteria.append(_of_delays(after, event, runs[0].task.hours))
+    return figures, criteria
+
+
+def _is_false(one: Reported, run: WorldRun, is_settlement: bool) -> bool:
+    right = (run.event_beacon,) if is_settlement else ()
+    return one.code == SETTLEMENT and one.beacons != right
+
+
+def _of_false(false: list[Reported], condition: str) -> Criterion:
+    verdict: Verdict = "fail" if false else "pass"
+    sentence = (
+        f"beacons at rest are reported to move: {'; '.join(one.text for one in false)}"
+        if false
+        else "no beacon at rest is reported to move"
+    )
+    if condition == "common-settlement":
+        sentence += " (a settlement of all beacons moves the pose with them: not observable)"
+    return Criterion("false_settlement", verdict, sentence)
+
+
+def _delay(run: WorldRun, event: Event) -> float | None:
+    """Return how long after the event a finding named its beacon (s)."""
+    times = [
+        one.time - event.begin
+        for one in run.reported
+        if run.event_beacon in one.beacons and one.time >= event.begin
+    ]
+    return min(times, default=None)
+
+
+def _of_delays(after: list[float | None], event: Event, hours: float) -> Criterion:
+    known = [t for t in after if t is not None]
+    in_time = len(known) == len(after) and max(known) <= event.within
+    verdict: Verdict = "pass" if in_time else "fail"
+    if not in_time and hours * HOUR < event.begin + event.within:
+        verdict = "undecided"
+    worst = f"{max(known) / HOUR:.2g} h at most" if known else "never"
+    sentence = (
+        f"{event.what} is reported in {len(known)} of {len(after)} worlds, after {worst}; limit"
+        f" {event.within / HOUR:g} h"
+    )
+    return Criterion("event_reported", verdict, sentence)
