@@ -21,7 +21,7 @@ INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
 # Declared moment uncertainty (log) of such a drive: heating and drift.
 MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
 OUTDOORS = DailySwing(amplitude=10.0, warmest_time=DAYTIME)  # half of the day's range
-STATIC_INTERVAL = 2.0  # s between two phasors of a static platform, as a monitor has them
+STATIC_INTERVAL = 2.0  # s; of the phasors of a static platform, which uses all samples
 
 
 def endurance_config(
@@ -42,6 +42,7 @@ def endurance_config(
             usual,
             events=Events(settlement=settlement),
             schedule=static,
+            window=STATIC_INTERVAL,
             rest_interval=STATIC_INTERVAL,
         )
     events = {

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from magfusion.estimation.data_checks.statistics import FALSE_ALARMS
 from magfusion.estimation.graph.state import State, states_of
@@ -41,7 +41,8 @@ LEAST_AVERAGES, MOST_AVERAGES = 8, 96  # two neighbours are joined where there a
 INTERVAL = 20.0  # s; between two poses at which the platform might have begun to rest
 NEAR, NEARLY = 0.02, 2.0 * DEGREE  # m, rad; estimates of one pose at rest differ by less
 POSE = 6  # components of a beacon's movement: rotation, then position
-UNOBSERVED = 1e-8  # share of the largest information
+UNOBSERVED = 1e-4  # share of the largest information, below which a direction is a gain or a phase
+TURN_GAIN = float(chdtri(3, 1e-3))  # what a turn explains by chance
 LARGEST_CORRELATION = 0.95  # of successive averages
 # By chance in one result of a rest, of which there are as many as averages.
 P_MOVED = FALSE_ALARMS / MOST_AVERAGES
@@ -130,6 +131,11 @@ class Movement(NamedTuple):
         """Distance moved (m)."""
         return float(np.linalg.norm(self.per_day[3:])) * self.days
 
+    @property
+    def _turn(self) -> str:
+        turn = float(np.rad2deg(np.linalg.norm(self.per_day[:3])))
+        return f", and turns by {turn:.2g} deg a day" if turn else ""
+
     def finding(self, site: Site) -> Finding:
         """Return the finding: a remark while the declared sigma covers the movement."""
         beacon = site.beacons[self.beacon]
@@ -144,8 +150,8 @@ class Movement(NamedTuple):
             f"Beacon {beacon.name} moves steadily against the others by at least"
             f" {1e3 * size:.2g} ±"
             f" {1e3 * sigma:.1g} mm a day ({axes}), {1e3 * self.distance:.2g} mm in the"
-            f" last {self.days * DAY / HOUR:.0f} h: it settles, its mount"
-            " creeps, or its coils drift against each other."
+            f" last {self.days * DAY / HOUR:.0f} h{self._turn}: it settles, its mount creeps, or"
+            " its coils drift against each other."
         )
         declared = beacon.sigma.position_world
         covered = self.distance <= float(np.linalg.norm(declared))
@@ -257,41 +263,57 @@ def movements(rest: Rest, beacons: int) -> list[Movement]:
     scatters = freedom * (len(count) - 2)
     variance = remaining / scatters * _correlated(np.sqrt(count)[:, None] * scatter) / moment
     slopes, by_movement = slope / np.sqrt(variance), rest.by_movement / np.sqrt(variance)
-    limit = POSE * float(fdtri(POSE, scatters, 1.0 - P_MOVED / beacons))
-    named: list[int] = []
-    excess = []
+    named: list[_Candidate] = []
     while len(named) < beacons - 1:
-        gains = _gains(slopes, by_movement, named, beacons)
-        best = int(np.argmax(gains))
-        if gains[best] < limit:
+        best = _best(slopes, by_movement, named, scatters)
+        if best.excess < 1.0:
             break
         named.append(best)
-        excess.append(float(gains[best]) / limit)
     if not named:
         return []
-    rows = np.concatenate([_rows(k) for k in named])
+    rows = np.concatenate([one.rows for one in named])
     information = by_movement[:, rows].T @ by_movement[:, rows]
     # A turn about the axis of a rotating beacon is a phase, a movement along the line of sight a
     # gain.
-    cov = np.linalg.pinv(information, rcond=UNOBSERVED, hermitian=True)
-    per_second = cov @ (by_movement[:, rows].T @ slopes)
+    cov = np.zeros((by_movement.shape[1],) * 2)
+    cov[np.ix_(rows, rows)] = np.linalg.pinv(information, rcond=UNOBSERVED, hermitian=True)
+    per_second = cov @ (by_movement.T @ slopes)
     days = float(np.ptp(rest.time)) / DAY
-    own = [slice(POSE * k, POSE * (k + 1)) for k in range(len(named))]
     return [
-        Movement(beacon, DAY * per_second[part], DAY**2 * cov[part, part], days, over)
-        for beacon, part, over in zip(named, own, excess, strict=True)
+        Movement(one.beacon, DAY * per_second[own], DAY**2 * cov[own, own], days, one.excess)
+        for one in named
+        for own in (slice(POSE * one.beacon, POSE * (one.beacon + 1)),)
     ]
 
 
-def _gains(slopes: Array, by_movement: Array, named: Sequence[int], beacons: int) -> Array:
-    """Return what a movement of each beacon explains in addition to those named, (beacons,)."""
-    basis = np.zeros((len(slopes), 0))
-    for k in named:
-        basis = np.concatenate([basis, _own_basis(by_movement[:, _rows(k)], basis)], axis=1)
-    gains = np.zeros(beacons)
-    for k in sorted(set(range(beacons)) - set(named)):
-        gains[k] = np.sum((_own_basis(by_movement[:, _rows(k)], basis).T @ slopes) ** 2)
-    return gains
+class _Candidate(NamedTuple):
+    """A movement of a beacon: a shift, or a shift with a turn."""
+
+    beacon: int
+    rows: IntArray  # of the movements of all beacons
+    excess: float  # of what it explains over the limit of chance
+
+
+def _best(
+    slopes: Array, by_movement: Array, named: Sequence[_Candidate], scatters: int
+) -> _Candidate:
+    """Return the movement that explains most in addition to those named."""
+    basis, beacons = np.zeros((len(slopes), 0)), by_movement.shape[1] // POSE
+    for one in named:
+        basis = np.concatenate([basis, _own_basis(by_movement[:, one.rows], basis)], axis=1)
+
+    def gain(rows: IntArray) -> float:
+        return float(np.sum((_own_basis(by_movement[:, rows], basis).T @ slopes) ** 2))
+
+    others = sorted(set(range(beacons)) - {one.beacon for one in named})
+    result = []
+    for beacon in others:
+        whole = POSE * beacon + np.arange(POSE)
+        shift = whole[POSE // 2 :]
+        rows = whole if gain(whole) - gain(shift) > TURN_GAIN else shift
+        limit = len(rows) * float(fdtri(len(rows), scatters, 1.0 - P_MOVED / beacons))
+        result.append(_Candidate(beacon, rows, gain(rows) / limit))
+    return max(result, key=lambda one: one.excess)
 
 
 def _own_basis(columns: Array, basis: Array) -> Array:
@@ -334,10 +356,6 @@ def _joined(count: Array, time: Array, mean: Array) -> tuple[Array, Array, Array
     times = np.sum(pairs * time.reshape(-1, 2), axis=1) / both
     joined = np.einsum("np,npk->nk", pairs, mean.reshape(len(both), 2, -1)) / both[:, None]
     return both, times, joined
-
-
-def _rows(beacon: int) -> IntArray:
-    return np.arange(POSE * beacon, POSE * (beacon + 1))
 
 
 def _blocks(site: Site, kinds: tuple[Parameter, ...]) -> tuple[Block, ...]:
