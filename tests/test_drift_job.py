@@ -14,6 +14,7 @@ from magfusion.errors import InputError
 from magfusion.files.checkpoint import Checkpoint, write_checkpoint
 from magfusion.jobs import drift, drift_world
 from magfusion.jobs.drift import DriftSettings, overall, run_drift, summarise
+from magfusion.jobs.drift_events import judge_events
 from magfusion.jobs.drift_figures import (
     after_settling,
     drift_of,
@@ -21,7 +22,7 @@ from magfusion.jobs.drift_figures import (
     nees_limits,
     verdict_of_one,
 )
-from magfusion.jobs.drift_world import WorldRun, WorldTask, run_world
+from magfusion.jobs.drift_world import Reported, WorldRun, WorldTask, run_world
 from magfusion.results.drift import QUANTITIES, ErrorSeries
 
 SHORT = 0.2  # h; two stretches
@@ -226,6 +227,35 @@ def unfinished(output, settings):
     return task.progress
 
 
+def events(condition, *reported, hours=48.0):
+    """Return the verdicts of what was reported in a world whose beacon B settles or is changed."""
+    run = a_run()
+    task = replace(run.task, condition=condition, hours=hours)
+    run = replace(run, task=task, reported=reported, event_beacon="B")
+    return {one.name: one.verdict for one in judge_events([run])[1]}
+
+
+def reported(code, beacon, hour):
+    return Reported(code, (beacon,), 3600.0 * hour, f"Beacon {beacon} is reported.")
+
+
+def test_an_event_is_to_be_reported_in_time():
+    noon, late = reported("beacon_excluded", "B", 12.1), reported("beacon_excluded", "B", 14.0)
+    assert events("exchange", noon) == {"event_reported": "pass"}
+    assert events("exchange", late) == {"event_reported": "fail"}
+    assert events("exchange", reported("beacon_excluded", "A", 12.1)) == {"event_reported": "fail"}
+    assert events("settlement", reported("settlement", "B", 20.0))["event_reported"] == "pass"
+    assert events("settlement", hours=12.0)["event_reported"] == "undecided"
+
+
+def test_a_beacon_at_rest_is_not_to_be_reported():
+    wrong = reported("settlement", "A", 20.0)
+    assert events("usual") == {}
+    assert events("usual", wrong) == {"false_settlement": "fail"}
+    assert events("common-settlement") == {"false_settlement": "pass"}
+    assert events("settlement", wrong)["false_settlement"] == "fail"
+
+
 @pytest.mark.slow
 def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
     output = tmp_path / "drift"
@@ -247,6 +277,8 @@ def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
     assert report["verdict"] in ("stable", "unstable", "inconclusive")
     assert report["accel_bias_stability"] == report["ekf_accel_bias_drift_stability"]
     assert report["ekf_bare_loops"] > 0.5
+    assert [row["hour"] for row in report["ekf_nees_by_hour"]] == [0.5]
+    assert report["condition"] == "usual"
     assert any("95 %" in note for note in report["notes"])
     assert not any(key.startswith("smoother") for key in report)
 

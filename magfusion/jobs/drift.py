@@ -140,6 +140,12 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
         raise
     figures = summarise(settings, runs)
     drawn = courses(settings, runs)
+    figures |= Figures(
+        *(
+            Figure(f"{course.name}_nees_by_hour", course.nees_by_hour(), section=Section.REPORT)
+            for course in drawn
+        )
+    )
     with claimed as directory:
         write_plot(directory / "drift.png", drawn, figures)
         write_stability(directory / "stability.png", drawn)

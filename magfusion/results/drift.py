@@ -7,7 +7,7 @@ scatter between independent worlds or, for a single world, from their correlatio
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import fdtrc, stdtrit
@@ -244,6 +244,16 @@ class EstimatorPlot:
         detected = self.pace[np.isfinite(self.pace[:, 4])]
         levels["innovation"] = in_windows(detected[:, 0], detected[:, 4], edges)
         return 0.5 * (edges[1:] + edges[:-1]) / HOUR, levels
+
+    def nees_by_hour(self) -> list[dict[str, Any]]:
+        """Return the NEES per degree of freedom of each hour that has states, over all worlds."""
+        hours, levels = self.hourly()
+        rows = zip(hours, levels["pose"], levels["bias"], strict=True)
+        return [
+            {"hour": float(hour), "pose": float(pose), "bias": float(bias)}
+            for hour, pose, bias in rows
+            if np.isfinite(pose)
+        ]
 
 
 def worlds_text(count: object) -> str:
