@@ -23,6 +23,7 @@ from magfusion.jobs.drift_figures import (
     verdict_of_one,
 )
 from magfusion.jobs.drift_world import Reported, WorldRun, WorldTask, run_world
+from magfusion.results.brief import lines
 from magfusion.results.drift import QUANTITIES, ErrorSeries
 
 SHORT = 0.2  # h; two stretches
@@ -254,6 +255,13 @@ def test_a_beacon_at_rest_is_not_to_be_reported():
     assert events("usual", wrong) == {"false_settlement": "fail"}
     assert events("common-settlement") == {"false_settlement": "pass"}
     assert events("settlement", wrong)["false_settlement"] == "fail"
+
+
+def test_the_screen_shows_what_was_reported():
+    run = a_run()
+    run = replace(run, reported=(reported("settlement", "B", 20.0),))
+    figures = summarise(DriftSettings(hours=24.0, worlds=1, estimators=("ekf",)), [run])
+    assert ["ekf reports", "20.00 h: settlement: Beacon B is reported."] in lines(figures)
 
 
 @pytest.mark.slow

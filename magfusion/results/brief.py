@@ -261,4 +261,6 @@ def _criteria(figures: Figures) -> Rows:
                 verdicts.setdefault(str(value), []).append(shown)
         listed = "; ".join(f"{verdict}: {', '.join(own)}" for verdict, own in verdicts.items())
         rows.append([f"{name}, other criteria", listed])
+        given = [one for one in figures.all if one.name == f"{name}_reported"]
+        rows += [[f"{name} reports", text] for one in given for text in sentences(one)]
     return rows
