@@ -16,6 +16,7 @@ from magfusion.estimation.online_integrity.settlement import (
     movements,
 )
 from magfusion.jobs.drift_conditions import declared_site, endurance_config
+from magfusion.jobs.drift_world import Reported, first_findings, navigate
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
@@ -189,19 +190,16 @@ def test_a_beacon_that_turns_is_reported_to_turn() -> None:
 @pytest.mark.slow
 def test_a_static_platform_reports_a_settlement() -> None:
     usual = endurance_config("settlement", 8.0, "current", 0.0)
-    config = replace(usual, events=Events(settlement=Settlement(per_day=6e-3)))
-    world = draw_endurance(declared_site("settlement", "current", False), config, (5, 0))
+    config = replace(usual, events=Events(settlement=Settlement(per_day=2e-3)))
+    world = draw_endurance(declared_site("settlement", "current", False), config, (3, 0))
     navigator, before = Navigator(world.site, NavigatorSettings(estimator="ekf")), world.start()
-    reported = {}
+    reported: tuple[Reported, ...] = ()
     for first in range(0, config.blocks, 10):
         stretch = world.stretch(first, 10, before)
-        before, imu = stretch.after, stretch.imu
-        navigator.add_imu(imu.time, imu.gyro_body, imu.accel_body)
-        navigator.add_fields(stretch.fields)
-        for state in navigator.take():
-            for finding in state.judgement.findings:
-                reported.setdefault(finding.code, (state.time, finding.text))
-    assert set(reported) == {"settlement"}, reported
-    time, text = reported["settlement"]
-    assert time < 8.0 * HOUR
-    assert text.startswith(f"Beacon {world.site.beacons[world.events.beacon].name} ")
+        *_, states = navigate(navigator, world, stretch)
+        before, reported = stretch.after, first_findings(states, reported)
+    assert len(reported) == 1, reported
+    (one,) = reported
+    assert one.code == "settlement"
+    assert one.beacons == (world.site.beacons[world.events.beacon].name,)
+    assert one.time < 8.0 * HOUR
