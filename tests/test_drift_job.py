@@ -246,6 +246,7 @@ def test_an_event_is_to_be_reported_in_time():
     assert events("exchange", late) == {"event_reported": "fail"}
     assert events("exchange", reported("beacon_excluded", "A", 12.1)) == {"event_reported": "fail"}
     assert events("settlement", reported("settlement", "B", 20.0))["event_reported"] == "pass"
+    assert events("settlement", reported("beacon_pose", "B", 2.0))["event_reported"] == "fail"
     assert events("settlement", hours=12.0)["event_reported"] == "undecided"
 
 

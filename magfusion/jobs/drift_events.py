@@ -16,6 +16,7 @@ class Event(NamedTuple):
     begin: float  # s
     within: float  # in which it is to be reported (s)
     what: str
+    code: str | None = None  # of the finding; None for any
 
 
 def event_of(task: WorldTask) -> Event | None:
@@ -24,7 +25,7 @@ def event_of(task: WorldTask) -> Event | None:
     if events.exchange is not None:
         return Event(events.exchange.time, HOUR, "the exchange")
     if events.settlement is not None and not events.settlement.whole:
-        return Event(0.0, 24.0 * HOUR, "the settlement")
+        return Event(0.0, 24.0 * HOUR, "the settlement", SETTLEMENT)
     return None
 
 
@@ -67,9 +68,10 @@ def _of_false(false: list[Reported], condition: str) -> Criterion:
 
 def _delay(run: WorldRun, event: Event) -> float | None:
     """Return how long after the event a finding named its beacon (s)."""
+    right = [one for one in run.reported if event.code in (None, one.code)]
     times = [
         one.time - event.begin
-        for one in run.reported
+        for one in right
         if run.event_beacon in one.beacons and one.time >= event.begin
     ]
     return min(times, default=None)
