@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.estimation.online_integrity.score_epochs import (
-    Epoch,
-    EpochTransition,
     Sums,
     _correlation,
     new_sums,
@@ -28,7 +26,6 @@ def _filtered(rng: np.random.Generator) -> tuple[Array, Sums]:
     true, estimate = rng.multivariate_normal(np.zeros(2), np.eye(2)), np.zeros(2)
     sums = new_sums(np.zeros((2, 2)), np.zeros(2), np.zeros((STATES, 2)), 0.0)
     by = np.hstack([BY_STATE, BY_CONSIDERED])
-    move = EpochTransition(TRANSITION, (np.eye(3), np.eye(3)), np.zeros(3), np.zeros(3))
     for _ in range(EPOCHS):
         true = TRANSITION @ true + rng.multivariate_normal(np.zeros(2), NOISE)
         estimate = TRANSITION @ estimate
@@ -42,9 +39,8 @@ def _filtered(rng: np.random.Generator) -> tuple[Array, Sums]:
         response = TRANSITION @ sums.response
         shown = BY_STATE @ response - BY_FIXED
         inverse = np.linalg.inv(BY_STATE @ given @ BY_STATE.T + np.eye(ROWS))
-        epochs = [Epoch(None, move)]  # type: ignore[arg-type]
         parts = BY_STATE[None], given[None], gain[None], shown[None], (inverse @ shown)[None]
-        cross_cov, excess = _correlation(sums, epochs, *parts, np.ones(2))
+        cross_cov, excess = _correlation(sums, [TRANSITION], *parts, np.ones(2))
         sums = replace(
             sums,
             information=sums.information + shown.T @ inverse @ shown,

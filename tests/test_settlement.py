@@ -92,12 +92,10 @@ def _rest() -> Rest:
 BEGUN = _rest()
 
 
-def _observed(
-    sites: list[Site], rng: np.random.Generator, *, drifting: bool = True
-) -> list[Movement]:
+def _observed(sites: list[Site], rng: np.random.Generator) -> list[Movement]:
     """Return the movements after a rest with two epochs an average, and clocks that advance."""
     rest = BEGUN
-    gain = np.exp(np.cumsum(1e-3 * rng.standard_normal((len(sites), 4)), axis=0)) ** drifting
+    gain = np.exp(np.cumsum(1e-3 * rng.standard_normal((len(sites), 4)), axis=0))
     for k, site in enumerate(sites):
         clock = np.exp(2j * np.pi * 0.13 * k * np.arange(1.0, 5.0))
         seen = (gain[k] * clock)[:, None] * _at_rest(site)

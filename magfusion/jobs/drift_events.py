@@ -32,14 +32,13 @@ def event_of(task: WorldTask) -> Event | None:
 def judge_events(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     """Return what was reported, and the judgement of it."""
     event = event_of(runs[0].task)
-    is_settlement = event is not None and event.begin == 0.0
+    is_settlement = event is not None and event.code == SETTLEMENT
     named = [f for run in runs for f in run.reported if f.code == SETTLEMENT]
-    right = [run.event_beacon for run in runs if is_settlement]
     false = [f for run in runs for f in run.reported if _is_false(f, run, is_settlement)]
     lines = [f"{f.time / HOUR:.2f} h: {f.code}: {f.text}" for run in runs for f in run.reported]
     figures = [Figure("reported", lines), Figure("false_settlements", len(false))]
     criteria = []
-    if runs[0].task.condition == "common-settlement" or named or right:
+    if "settlement" in runs[0].task.condition or named:
         criteria.append(_of_false(false, runs[0].task.condition))
     if event is not None:
         after = [_delay(run, event) for run in runs]

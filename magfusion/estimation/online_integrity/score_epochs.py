@@ -124,9 +124,9 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
     whole = np.einsum("k,kij->ij", kept[1:], reported)
-    cross_cov, excess = _correlation(
-        sums, epochs, by_own, alone, gain, shown, solved[..., :-1], kept
-    )
+    led = [None if one.passed is None else one.passed.transition[own, own] for one in epochs]
+    rows = by_own, alone, gain, shown, solved[..., :-1]
+    cross_cov, excess = _correlation(sums, led, *rows, kept)
     return replace(
         sums,
         information=kept[0] * sums.information + whole[:, :-1],
@@ -140,7 +140,7 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
 
 def _correlation(
     sums: Sums,
-    epochs: Sequence[Epoch],
+    transitions: Sequence[Array | None],
     jacobian: Array,
     cov: Array,
     gain: Array,
@@ -152,6 +152,8 @@ def _correlation(
 
     Parameters
     ----------
+    transitions : sequence of ndarray or None
+        (n, n), of the state to each epoch; None where it was not propagated.
     jacobian, cov, gain : ndarray
         (epochs, m, n), (epochs, n, n), (epochs, n, m), of the rows by the state, of the state given
         the parameters, and of the update.
@@ -160,12 +162,12 @@ def _correlation(
     kept : ndarray, shape (epochs + 1,)
         Weight of the sums before, and of each epoch.
     """
-    own, size = slice(0, cov.shape[1]), shown.shape[2]
+    size = shown.shape[2]
     cross_cov, appears = sums.cross_cov, np.empty_like(shown)
-    for k, epoch in enumerate(epochs):
+    for k, transition in enumerate(transitions):
         cross_cov = kept[k] / kept[k + 1] * cross_cov
-        if epoch.passed is not None:
-            cross_cov = epoch.passed.transition[own, own] @ cross_cov
+        if transition is not None:
+            cross_cov = transition @ cross_cov
         appears[k] = jacobian[k] @ cross_cov
         cross_cov = cross_cov + cov[k] @ (jacobian[k].T @ weight[k])
         cross_cov = cross_cov - gain[k] @ (appears[k] + shown[k])

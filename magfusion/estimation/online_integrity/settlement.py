@@ -16,6 +16,7 @@ from scipy.special import chdtri, fdtri
 
 from magfusion.estimation.data_checks.statistics import FALSE_ALARMS
 from magfusion.estimation.graph.state import State, states_of
+from magfusion.estimation.integrity.fixed_parameter_test import MARGIN
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.detection_range import are_many
@@ -182,7 +183,7 @@ class SettlementTest:
         self._moving = _blocks(site, (BEACON_ROTATION, BEACON_POSITION))
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the movements found in this rest, or in the last one."""
+        """Return the movements in this rest, or in the last one while this one is short."""
         return self._movements
 
     def update(self, phasors: FieldPhasors, samples: FieldSamples, state: State) -> None:
@@ -200,7 +201,7 @@ class SettlementTest:
         self._rest = rest.with_epoch(state.time, phasors.measured[0], weight)
         if len(self._rest.count) != len(rest.count) >= LEAST_AVERAGES:  # an average is complete
             moved = movements(rest, len(self.site.beacons))
-            self._movements = tuple(one.finding(self.site) for one in moved) or self._movements
+            self._movements = tuple(one.finding(self.site) for one in moved)
 
     def _continues(self, rest: Rest, samples: FieldSamples, state: State) -> bool:
         """Return whether the platform is still where it was, with beacons as they were."""
@@ -248,7 +249,8 @@ class SettlementTest:
 def movements(rest: Rest, beacons: int) -> list[Movement]:
     """Return the beacons that move steadily, the most certain first.
 
-    One more is named only where those named do not explain the slopes.  A step is none.
+    One more is named only where those named do not explain the slopes, and none while another
+    beacon explains them as well.  A step is none.
     """
     count, time = rest.count, rest.time - np.average(rest.time, weights=rest.count)
     freedom = 2 * int(np.count_nonzero(rest.there)) - rest.explained.shape[1]
@@ -265,8 +267,8 @@ def movements(rest: Rest, beacons: int) -> list[Movement]:
     slopes, by_movement = slope / np.sqrt(variance), rest.by_movement / np.sqrt(variance)
     named: list[_Candidate] = []
     while len(named) < beacons - 1:
-        best = _best(slopes, by_movement, named, scatters)
-        if best.excess < 1.0:
+        best, *others = _ranked(slopes, by_movement, named, scatters)
+        if best.excess < 1.0 or any(one.gain > best.gain - MARGIN for one in others):
             break
         named.append(best)
     if not named:
@@ -291,13 +293,14 @@ class _Candidate(NamedTuple):
 
     beacon: int
     rows: IntArray  # of the movements of all beacons
-    excess: float  # of what it explains over the limit of chance
+    gain: float  # decrease of -2 log likelihood
+    excess: float  # of the gain over the limit of chance
 
 
-def _best(
+def _ranked(
     slopes: Array, by_movement: Array, named: Sequence[_Candidate], scatters: int
-) -> _Candidate:
-    """Return the movement that explains most in addition to those named."""
+) -> list[_Candidate]:
+    """Return what a movement of each other beacon explains in addition, the most first."""
     basis, beacons = np.zeros((len(slopes), 0)), by_movement.shape[1] // POSE
     for one in named:
         basis = np.concatenate([basis, _own_basis(by_movement[:, one.rows], basis)], axis=1)
@@ -312,8 +315,8 @@ def _best(
         shift = whole[POSE // 2 :]
         rows = whole if gain(whole) - gain(shift) > TURN_GAIN else shift
         limit = len(rows) * float(fdtri(len(rows), scatters, 1.0 - P_MOVED / beacons))
-        result.append(_Candidate(beacon, rows, gain(rows) / limit))
-    return max(result, key=lambda one: one.excess)
+        result.append(_Candidate(beacon, rows, gain(rows), gain(rows) / limit))
+    return sorted(result, key=lambda one: -one.excess)
 
 
 def _own_basis(columns: Array, basis: Array) -> Array:
