@@ -189,7 +189,7 @@ class SettlementTest:
     def update(self, phasors: FieldPhasors, samples: FieldSamples, state: State) -> None:
         """Process an epoch: its fields, whether rejected or not, and the state after it."""
         rest = self._rest
-        if not self._is_tested:
+        if not self._is_tested or not np.any(samples.there):
             return
         if rest is None or not self._continues(rest, samples, state):
             if rest is not None and state.time < rest.begin + INTERVAL:
