@@ -8,19 +8,19 @@ from magfusion.model.parameters import Block
 from magfusion.units import Array
 
 # A dipole's field at a displacement s from distance r deviates from its tangent by up to
-# 6 (s / r)^2 of itself: at two sigma of a prediction with this uncertainty by .0024, about half of
-# the usual model error.  A rotation deviates by half of its square.
-WIDE_OF_DISTANCE, WIDE_ROTATION = 0.01, 0.03  # of the nearest beacon's distance; rad
-CONVERGED_STEP = 0.001  # last step, of the distance, or rad: the remaining error is 6e-6 of a field
+# 6 (s / r)^2 of itself, a rotated one by half of its square.
+BY_DISTANCE, BY_ROTATION = 6.0, 0.5
+# Of the noise.  The deviation is not zero in the mean: that of a platform at rest is the same in
+# thousands of epochs, of which it must be no signal.
+LARGEST_DEVIATION = 0.02  # sigma
 MAX_ITERATIONS = 10
 
 
-def is_curved(predicted: State) -> bool:
-    """Return whether fields are nonlinear over the uncertainty of a prediction."""
+def is_curved(phasors: FieldPhasors, predicted: State) -> bool:
+    """Return whether an epoch's fields are nonlinear over the uncertainty of its prediction."""
     cov = predicted.cov
-    if np.trace(cov[ROTATION, ROTATION]) > WIDE_ROTATION**2:
-        return True
-    return bool(np.trace(cov[POSITION, POSITION]) > (WIDE_OF_DISTANCE * _nearest(predicted)) ** 2)
+    rotated, shifted = np.trace(cov[ROTATION, ROTATION]), np.trace(cov[POSITION, POSITION])
+    return _deviation(phasors, rotated, shifted, _nearest(predicted)) > LARGEST_DEVIATION
 
 
 def relinearized(
@@ -33,7 +33,7 @@ def relinearized(
     `predicted`: with its covariance. `blocks`: calibration parameters in its tangent. Returns None
     if the steps do not converge.
     """
-    pose, distance = predicted.pose, _nearest(predicted)
+    pose, nearest = predicted.pose, _nearest(predicted)
     for _ in range(MAX_ITERATIONS):
         result = phasors.linearized_at(pose.rotation().matrix(), np.asarray(pose.translation()))
         step = _step(result, predicted, blocks)
@@ -41,8 +41,8 @@ def relinearized(
             return None
         before, pose = pose, predicted.pose.retract(step)
         moved = before.localCoordinates(pose)
-        rotated, shifted = np.linalg.norm(moved[ROTATION]), np.linalg.norm(moved[POSITION])
-        if rotated < CONVERGED_STEP and shifted < CONVERGED_STEP * distance:
+        rotated, shifted = np.sum(moved[ROTATION] ** 2), np.sum(moved[POSITION] ** 2)
+        if _deviation(result, rotated, shifted, nearest) < LARGEST_DEVIATION:
             return result
     return None
 
@@ -56,6 +56,17 @@ def _step(phasors: FieldPhasors, predicted: State, blocks: tuple[Block, ...]) ->
     innovation_cov = jacobian @ crossed + np.eye(len(jacobian))
     gain = np.linalg.solve(innovation_cov, crossed[:6].T).T
     return np.asarray(-gain @ rows.error.reshape(-1))
+
+
+def _deviation(phasors: FieldPhasors, rotated: float, shifted: float, nearest: float) -> float:
+    """Return the largest deviation of an epoch's fields from their tangent (sigma).
+
+    `rotated`, `shifted`: square of a displacement (rad^2, m^2). `nearest`: distance of the nearest
+    beacon (m).
+    """
+    fields = phasors.sqrt_information[0] @ phasors.measured[0, :, :, None]
+    relative = BY_ROTATION * rotated + BY_DISTANCE * shifted / nearest**2
+    return float(relative * np.max(np.linalg.norm(fields[..., 0], axis=1), initial=0.0))
 
 
 def _nearest(state: State) -> float:

@@ -93,7 +93,7 @@ class LossRecovery:
             return measured, None, nothing
         if not _wide(state):
             self._pointing.over()
-            if not is_curved(state):
+            if not is_curved(measured.phasors, state):
                 return measured, None, nothing
             at = relinearized(measured.phasors, state, self._blocks)
             return measured if at is None else replace(measured, phasors=at), None, nothing
