@@ -9,6 +9,7 @@ from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.online_integrity.beacon_consistency import contradicting
 from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
 from magfusion.model.parameters import Block
 from magfusion.units import Array, BoolArray
@@ -34,6 +35,7 @@ class Gate:
     accepted: dict[str, float]
     refused: dict[str, float]
     _limit: Array
+    _noise: float  # factor of the variances that the limits allow
 
     def __init__(
         self,
@@ -60,6 +62,7 @@ class Gate:
         limit = [COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, f) for f in freedom]
         known = COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, np.inf)
         self._limit = np.minimum(limit, NOISE_FACTOR**2 * known)[self._number]
+        self._noise = float(np.max(self._limit)) / known
 
     @property
     def is_lost(self) -> bool:
@@ -83,6 +86,9 @@ class Gate:
         beyond: BoolArray = np.asarray(distance > self._limit)
         false = self.watch.update(beyond, valid)
         rejected: BoolArray = np.asarray(beyond | refused | false) & valid
+        if isinstance(measurements, FieldPhasors):
+            of_beacons = self.blocks, self._number, valid, valid & ~rejected, self._noise
+            rejected |= contradicting(measurements, state, *of_beacons)
         self._note(distance, valid)
         self.accepted = self._by_beacon(distance, valid & ~rejected)
         self.refused = self._by_beacon(distance, rejected)
