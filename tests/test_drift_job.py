@@ -242,20 +242,26 @@ def reported(code, beacon, hour):
 
 def test_an_event_is_to_be_reported_in_time():
     noon, late = reported("beacon_excluded", "B", 12.1), reported("beacon_excluded", "B", 14.0)
-    assert events("exchange", noon) == {"event_reported": "pass"}
-    assert events("exchange", late) == {"event_reported": "fail"}
-    assert events("exchange", reported("beacon_excluded", "A", 12.1)) == {"event_reported": "fail"}
+    right, wrong = {"false_findings": "pass"}, {"false_findings": "fail"}
+    assert events("exchange", noon) == {**right, "event_reported": "pass"}
+    assert events("exchange", late) == {**right, "event_reported": "fail"}
+    of_another = reported("beacon_excluded", "A", 12.1)
+    assert events("exchange", of_another) == {**wrong, "event_reported": "fail"}
+    assert events("exchange", noon, of_another) == {**wrong, "event_reported": "pass"}
     assert events("settlement", reported("settlement", "B", 20.0))["event_reported"] == "pass"
     assert events("settlement", reported("beacon_pose", "B", 2.0))["event_reported"] == "fail"
     assert events("settlement", hours=12.0)["event_reported"] == "undecided"
 
 
-def test_a_beacon_at_rest_is_not_to_be_reported():
+def test_nothing_is_to_be_reported_that_did_not_happen():
     wrong = reported("settlement", "A", 20.0)
-    assert events("usual") == {}
-    assert events("usual", wrong) == {"false_settlement": "fail"}
-    assert events("common-settlement") == {"false_settlement": "pass"}
-    assert events("settlement", wrong)["false_settlement"] == "fail"
+    assert events("usual") == {"false_findings": "pass"}
+    assert events("usual", wrong) == {"false_findings": "fail"}
+    assert events("usual", reported("lost", "", 20.0)) == {"false_findings": "fail"}
+    assert events("common-settlement") == {"false_findings": "pass"}
+    assert events("settlement", wrong)["false_findings"] == "fail"
+    early = reported("beacon_excluded", "B", 11.0)
+    assert events("exchange", early)["false_findings"] == "fail"
 
 
 def test_the_screen_shows_what_was_reported():

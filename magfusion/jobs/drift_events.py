@@ -32,14 +32,10 @@ def event_of(task: WorldTask) -> Event | None:
 def judge_events(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     """Return what was reported, and the judgement of it."""
     event = event_of(runs[0].task)
-    is_settlement = event is not None and event.code == SETTLEMENT
-    named = [f for run in runs for f in run.reported if f.code == SETTLEMENT]
-    false = [f for run in runs for f in run.reported if _is_false(f, run, is_settlement)]
+    false = [f for run in runs for f in run.reported if not _has_happened(f, run, event)]
     lines = [f"{f.time / HOUR:.2f} h: {f.code}: {f.text}" for run in runs for f in run.reported]
-    figures = [Figure("reported", lines), Figure("false_settlements", len(false))]
-    criteria = []
-    if "settlement" in runs[0].task.condition or named:
-        criteria.append(_of_false(false, runs[0].task.condition))
+    figures = [Figure("reported", lines), Figure("false_findings", len(false))]
+    criteria = [_of_false(false, runs[0].task.condition)]
     if event is not None:
         after = [_delay(run, event) for run in runs]
         hours = ["never" if t is None else f"{t / HOUR:.2f}" for t in after]
@@ -48,21 +44,21 @@ def judge_events(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     return figures, criteria
 
 
-def _is_false(one: Reported, run: WorldRun, is_settlement: bool) -> bool:
-    right = (run.event_beacon,) if is_settlement else ()
-    return one.code == SETTLEMENT and one.beacons != right
+def _has_happened(one: Reported, run: WorldRun, event: Event | None) -> bool:
+    return event is not None and one.beacons == (run.event_beacon,) and one.time >= event.begin
 
 
 def _of_false(false: list[Reported], condition: str) -> Criterion:
     verdict: Verdict = "fail" if false else "pass"
-    sentence = (
-        f"beacons at rest are reported to move: {'; '.join(one.text for one in false)}"
-        if false
-        else "no beacon at rest is reported to move"
-    )
+    sentence = "nothing is reported that did not happen"
+    if false:
+        first = min(false, key=lambda one: one.time)
+        sentence = (
+            f"{len(false)} findings are wrong, first after {first.time / HOUR:.2f} h: {first.text}"
+        )
     if condition == "common-settlement":
         sentence += " (a settlement of all beacons moves the pose with them: not observable)"
-    return Criterion("false_settlement", verdict, sentence)
+    return Criterion("false_findings", verdict, sentence)
 
 
 def _delay(run: WorldRun, event: Event) -> float | None:
