@@ -58,6 +58,12 @@ def test_one_parameter_moves_fields_as_a_step_of_the_calibration_does(kind: str)
         np.testing.assert_allclose(predict_channels(by_site, time, turn, place), expected)
 
 
+def test_each_fault_has_a_name_of_its_own() -> None:
+    """A fault is recognised by its name in the solution that is corrected for another."""
+    names = [fault.name for fault in suspects(SITE, FIXED)]
+    assert len(set(names)) == len(names)
+
+
 def test_a_tilt_turns_places_and_attitudes_together() -> None:
     fault = next(one for one in suspects(SITE, FIXED) if one.code == TILT)
     tilted = corrected_site(SITE, fault, fault.combine @ (np.deg2rad([2.0, -1.0]) / TYPICAL_TILT))

@@ -237,7 +237,8 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
 
 def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]:
     """Yield what would have a number of all beacons wrong alike."""
-    kinds: dict[str, tuple[Parameter, str]] = {f"the moments of {_beacons(site)}": (LOG_MOMENT, "")}
+    scale = f"the scale of the moments of {_beacons(site)}"
+    kinds: dict[str, tuple[Parameter, str]] = {scale: (LOG_MOMENT, "")}
     if not site.platform.further:
         kinds["the sampling rate of the magnetometer"] = (DRIFT, SAMPLE_RATE)
     for name, (parameter, code) in kinds.items():
