@@ -121,7 +121,7 @@ def test_a_key_that_goes_is_told_too() -> None:
     declared = replace(SITE, location=place, earth_field_world=None)
     changed = changed_keys(declared, replace(SITE, location=None))
     assert "world.earth_field_t" in changed
-    assert changed["world.location.latitude_deg"] is None
+    assert changed["world.location"] is None
 
 
 def test_a_bias_beyond_its_sigma_is_declared_to_be_so_uncertain() -> None:

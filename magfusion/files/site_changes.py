@@ -1,5 +1,6 @@
 """Differences between sites: by the keys of their files, and as the content of a checkpoint."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,11 @@ from magfusion.model.without_imu import on_motion_prior
 def changed_keys(before: Site, after: Site) -> dict[str, Any]:
     """Return the keys of a site's file whose values differ, as ``beacons[0].position_m``.
 
-    The values are those of the second site; None for a key that it does not have.
+    The values are those of the second site; None for a key that it does not have. A list of another
+    length is one value.
     """
-    old, new = (_flat(site_content(site)) for site in (before, after))
-    return {key: new.get(key) for key in {**old, **new} if old.get(key) != new.get(key)}
+    old, new = (site_content(site) for site in (before, after))
+    return dict(_changed(old, new, ""))
 
 
 def with_content(site: Site, content: str) -> Site:
@@ -44,14 +46,19 @@ def with_content(site: Site, content: str) -> Site:
     )
 
 
-def _flat(entry: Any, key: str = "") -> dict[str, Any]:
-    """Return the values of nested mappings, and of lists of mappings, by their key."""
-    if isinstance(entry, dict):
-        parts = {f"{key}.{name}" if key else name: value for name, value in entry.items()}
-    elif isinstance(entry, list) and entry and isinstance(entry[0], dict):
-        parts = {f"{key}[{i}]": value for i, value in enumerate(entry)}
-    else:
-        return {key: entry}
-    return {
-        name: value for part, inner in parts.items() for name, value in _flat(inner, part).items()
-    }
+def _changed(old: Any, new: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """Yield key and new value of what differs in nested mappings and lists of mappings."""
+    if isinstance(new, dict) and isinstance(old, dict | None):
+        old = old or {}
+        for name in {**old, **new}:
+            inner = f"{key}.{name}" if key else name
+            yield from _changed(old.get(name), new.get(name), inner)
+    elif _is_of_mappings(old) and _is_of_mappings(new) and len(old) == len(new):
+        for i, (before, after) in enumerate(zip(old, new, strict=True)):
+            yield from _changed(before, after, f"{key}[{i}]")
+    elif old != new:
+        yield key, new
+
+
+def _is_of_mappings(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
