@@ -31,6 +31,10 @@ class InertialColumns(NamedTuple):
         out[..., self.at] = of_bias @ self.bias[some]
         return out
 
+    def moved(self, step: Array) -> Array:
+        """Return the change of the errors by a step of all columns (number,), (intervals, 15)."""
+        return np.einsum("nrb,nbk,k->nr", self.of_bias, self.bias, step[self.at])
+
     def part(self, columns: slice) -> "InertialColumns":
         """Return a subset of the columns."""
         inside = (self.at >= columns.start) & (self.at < columns.stop)

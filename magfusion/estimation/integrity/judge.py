@@ -129,7 +129,7 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     if change.findings:  # it explains more than whatever is wrong throughout
         of_held = TestResult(unverified=of_held.unverified)
     after, causes = _explained(case, of_held.named)
-    residuals = _residuals(case, after)
+    residuals = _residuals(case, *after)
     cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
     cause = max(cause, _weight(change))
     if causes < len(of_held.named) and rest:  # residuals that none of them explains
@@ -153,7 +153,7 @@ def _with_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[T
     of_held, priors, biases = others
     cause = _weight(bent)
     yield replace(bent, unverified=of_held.unverified)
-    for findings in (*_residuals(case, _explained(case, ())[0]), priors):
+    for findings in (*_residuals(case, *_explained(case, ())[0]), priors):
         yield _traces(findings, 10.0 * cause)
     yield _traces(compass(case), cause)
     yield _traces(biases, cause)
@@ -161,25 +161,31 @@ def _with_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[T
         yield monitor(case)
 
 
-def _residuals(case: Case, after: GraphEstimate) -> list[TestResult]:
-    """Return the tests of residuals at an estimate."""
+def _residuals(case: Case, after: GraphEstimate, step: Array) -> list[TestResult]:
+    """Return the tests of residuals at an estimate after a step of the fixed parameters."""
     ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
-    return [fields(case, *ends), inertial(case, after)]
+    return [fields(case, *ends), inertial(case, after, step)]
 
 
-def _explained(case: Case, named: tuple[Array, ...]) -> tuple[GraphEstimate, int]:
+def _explained(case: Case, named: tuple[Array, ...]) -> tuple[tuple[GraphEstimate, Array], int]:
     """Return the estimate at which residuals are tested, and the number of causes it includes.
 
-    One or two causes may explain residuals; if more are needed, the model itself is wrong.
+    With the estimate, the step of the fixed parameters that leads to it. One or two causes may
+    explain residuals; if more are needed, the model itself is wrong.
     """
     result, score = case.result, case.score
     if score is None:
-        return result.estimate, 0
-    before = moved_estimate(result, score, score.allowed(np.zeros(len(score.gradient))))
-    least = max(EXPLAINED * _square(result, before), 1.0)
+        return (result.estimate, np.zeros(0)), 0
+
+    def moved(step: Array) -> tuple[GraphEstimate, Array]:
+        whole = score.allowed(step)
+        return moved_estimate(result, score, whole), whole
+
+    before = moved(np.zeros(len(score.gradient)))
+    least = max(EXPLAINED * _square(result, before[0]), 1.0)
     for number, step in enumerate(named[:FEW], 1):
-        after = moved_estimate(result, score, score.allowed(step))
-        if _square(result, after) < least:
+        after = moved(step)
+        if _square(result, after[0]) < least:
             return after, len(named) if number == len(named) else number
     return before, 0
 

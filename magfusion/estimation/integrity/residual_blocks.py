@@ -25,6 +25,7 @@ from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
 from magfusion.estimation.data_checks.still_means import SPAN, still_means
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import states_in
+from magfusion.estimation.integrity.fixed_parameter_columns import inertial_columns
 from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
 from magfusion.estimation.integrity.smoothed_exclusion import LEFT_OUT
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
@@ -255,8 +256,8 @@ def _persistence(residual: Array) -> float:
     return total
 
 
-def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
-    """Test the inertial residuals at an estimate."""
+def inertial(case: Case, estimate: GraphEstimate, step: Array) -> TestResult:
+    """Test the inertial residuals at an estimate after a step of the fixed parameters, (h,)."""
     result = case.result
     if result.graph.epochs < 4 or not result.graph.measurements:
         return NOTHING
@@ -266,6 +267,8 @@ def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     except RuntimeError:  # of an undetermined stretch, which other tests report
         return NOTHING
     error, blocks = inertial_errors(result, estimate), blocks_of(time)
+    if case.score is not None and case.log.inertial:
+        error += inertial_columns(result, case.score.fixed, case.log.imu).moved(step)
     tests: list[Misfit] = []
     for row, name in AXES.items():
         if expected[row] > 1e-6:
