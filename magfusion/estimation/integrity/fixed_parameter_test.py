@@ -1,8 +1,9 @@
 """Fixed-parameter test: which fixed parameter a log contradicts, and which it cannot check.
 
 Significance is not consequence: a parameter fails if its evidence is large, and if it would move
-the poses beyond their covariance or is of an IMU that is farther off than usual.  The one with the
-most evidence is the cause; after its step, the next is tested.
+the poses beyond their covariance, is of an IMU that is farther off than usual, or explains
+residuals that would be reported without it.  The one with the most evidence is the cause; after its
+step, the next is tested.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -38,8 +39,11 @@ LEAST_SHARE = 0.03  # of the first cause's evidence; less may be its nonlinear r
 UNCHECKED = 4.3**2  # chi square below which one of fifty candidates is not detected
 
 
-def check_fixed_parameters(case: Case) -> TestResult:
-    """Test all fixed parameters."""
+def check_fixed_parameters(case: Case, *, without_effect: bool = False) -> TestResult:
+    """Test all fixed parameters.
+
+    `without_effect`: whether causes are named that do not move the poses.
+    """
     if case.score is None:
         return NOTHING
     score, site = case.score, case.result.declared.site
@@ -51,6 +55,7 @@ def check_fixed_parameters(case: Case) -> TestResult:
             score,
             lambda *_: candidates,
             lambda one, before: _exceeds_residuals(case, score, one, before),
+            without_effect=without_effect,
         )
     )
     if not causes:
@@ -83,11 +88,13 @@ def causes_of(
     score: Score,
     candidates: Callable[[Array, Array], Sequence[Suspect]],
     is_cause: Callable[[ReleasedFault, Array], bool] = lambda *_: True,
+    *,
+    without_effect: bool = False,
 ) -> Iterator[NamedCause]:
     """Yield the causes, that with most evidence first; the next is of what remains after its step.
 
     `candidates`: candidate faults by information and gradient. `is_cause`: whether a fault is a
-    cause after a total step.
+    cause after a total step. `without_effect`: whether those are included that are no mistakes.
     """
     information, gradient = score.with_declared(tolerance=False)
     total, first = np.zeros(len(gradient)), 0.0
@@ -106,7 +113,7 @@ def causes_of(
             return
         first = max(first, cause.gain)
         total = total + cause.step
-        if cause.is_mistake:
+        if cause.is_mistake or without_effect:
             yield NamedCause(cause, rivals_of(cause, ranked), total)
         selected = information @ cause.cov
         gradient = gradient - information @ cause.step

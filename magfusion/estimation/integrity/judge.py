@@ -128,8 +128,7 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
         return
     if change.findings:  # it explains more than whatever is wrong throughout
         of_held = TestResult(unverified=of_held.unverified)
-    after, causes = _explained(case, of_held.named)
-    residuals = _residuals(case, *after)
+    of_held, causes, residuals = _with_residuals(case, of_held)
     cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
     cause = max(cause, _weight(change))
     if causes < len(of_held.named) and rest:  # residuals that none of them explains
@@ -159,6 +158,24 @@ def _with_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[T
     yield _traces(biases, cause)
     for monitor in (fixes, together, convergence, geometry, rivals):
         yield monitor(case)
+
+
+def _with_residuals(case: Case, of_held: TestResult) -> tuple[TestResult, int, list[TestResult]]:
+    """Return the test of fixed parameters, and the residuals that it does not explain.
+
+    With the number of its causes that explain them. One that explains the residuals of the fields
+    is named for them, though it moves no pose.
+    """
+    after, causes = _explained(case, of_held.named)
+    residuals = _residuals(case, *after)
+    if causes or not residuals[0].findings:
+        return of_held, causes, residuals
+    other = check_fixed_parameters(case, without_effect=True)
+    after, causes = _explained(case, other.named)
+    explained = _residuals(case, *after) if causes else residuals
+    if not causes or explained[0].findings:
+        return of_held, 0, residuals
+    return other, causes, explained
 
 
 def _residuals(case: Case, after: GraphEstimate, step: Array) -> list[TestResult]:
