@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from small_problem import small_log
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.posterior import variance_components
 from magfusion.estimation.posterior.noise_tuning import Tuned, tuned_site
 from magfusion.estimation.posterior.residual_redundancy import ChannelErrors
@@ -101,6 +102,25 @@ def test_densities_declared_too_small_are_found(log: Log) -> None:
 
 
 @pytest.mark.slow
+def test_a_tenth_of_the_noise_declared_is_reported_and_the_sigmas_are_right(log: Log) -> None:
+    """By so much no fault is hidden: the samples themselves show their white noise."""
+    result, trust = judge_result(smooth(log, declared(imu=0.1)), log)
+    for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):
+        (one,) = (t for t in result.noise if t.key == kind)
+        assert one.declared == pytest.approx(0.1 * true)
+        assert 0.7 * true < one.estimated < 1.4 * true
+    (finding,) = trust.reasons
+    assert finding.code == "noise_tuned"
+    assert set(finding.remedy or ()) == {"platform.imu.gyro_noise", "platform.imu.accel_noise"}
+    sigma = [
+        float(np.sqrt(np.mean(np.trace(one.states.pose_cov, axis1=1, axis2=2))))
+        for one in (result, judge_result(smooth(log, declared()), log)[0])
+        if one.states.pose_cov is not None
+    ]
+    assert sigma[0] == pytest.approx(sigma[1], rel=0.2)
+
+
+@pytest.mark.slow
 def test_what_is_declared_too_large_of_the_imu_stays(log: Log) -> None:
     """Scale and vibration may be in it, which are not white."""
     result = smooth(log, declared(imu=3.0))
@@ -144,6 +164,9 @@ def test_more_than_three_times_the_noise_is_a_doubt_and_less_is_only_said() -> N
     assert remark.verdict is Verdict.TRUSTWORTHY
     assert "beacon A" in remark.text
     assert list(tuned_noise([usual])) == []
+    (of_imu,) = tuned_noise([Tuned("imu", "gyro_noise", 3e-4, 1.234e-3)])
+    assert of_imu.remedy == {"platform.imu.gyro_noise": 1.23e-3}
+    assert doubt.remedy is None
     site = tuned_site(demo_site(), [stronger, quieter, usual])
     assert [b.model_error for b in site.beacons] == [None, 0.04, None, None]
     assert site.platform.imu.gyro_noise == 8e-4

@@ -22,6 +22,7 @@ from magfusion.estimation.batch.outer_iterations import PassFile
 from magfusion.estimation.batch.preprocessed_log import preprocess
 from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.data_checks.data_cleaning import clean_log
+from magfusion.estimation.data_checks.inertial_noise import with_measured_noise
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.graph.graph import Graph, GraphEstimate, read_states
 from magfusion.estimation.graph.measurement import Measurement
@@ -32,7 +33,7 @@ from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.posterior.convergence import last_move, refuse_open
 from magfusion.estimation.posterior.marginals import marginals
-from magfusion.estimation.posterior.noise_tuning import Tuned
+from magfusion.estimation.posterior.noise_tuning import Tuned, compared_with
 from magfusion.estimation.snapshot.survey_error import survey_response
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.estimation.solve.memory import give_back_memory
@@ -175,6 +176,9 @@ def _solved(
     first, time, steps = log.declared, log.states.time, settings.max_iterations + 3
     calm = quiet_before(log.imu, time - first.imu_offset(time), first.site.platform.motion)
     known = None if iterations_file is None else iterations_file.begun(log)
+    if settings.tune:
+        log = replace(log, declared=replace(first, site=with_measured_noise(first.site, log.imu)))
+    prior = log.declared.site
     now = begin_iterations(log, settings) if known is None else known
     log = replace(log, declared=now.declared)
     while True:
@@ -185,9 +189,7 @@ def _solved(
         converged = nothing_moved(before, now, solved)
         if plan.finds_noise:
             give_back_memory()
-            newest = noise_of(
-                log, solved.graph, solved.solution.estimate, now.states, wave, first.site
-            )
+            newest = noise_of(log, solved.graph, solved.solution.estimate, now.states, wave, prior)
             now, converged = retune(before, now, newest, plan), False
             log = replace(log, declared=now.declared)
         if converged or now.done >= settings.max_iterations:
@@ -211,7 +213,7 @@ def _solved(
         move = last_move(before.states, result.states, unfinished)
     return replace(
         result,
-        noise=now.tuned,
+        noise=compared_with(now.tuned, first.site),
         standing=now.standing,
         iteration_count=now.done,
         iterations=now.iterations,

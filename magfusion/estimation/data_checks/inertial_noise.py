@@ -54,11 +54,20 @@ def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, l
         model = replace(model, **{key: density})
         text = (
             f"{name}: the noise is {density:.2g} {unit}/sqrt(Hz) even in the quietest parts,"
-            f" {density / usual:.1f} times the declared {key}: the reported sigmas are too small."
-            f" Declare {key}: {density:.2g}, or the value of the data sheet."
+            f" {density / usual:.1f} times the declared {key}. Declare {key}: {density:.2g}, or the"
+            " value of the data sheet."
         )
-        findings.append(Finding("imu_noise", text, Verdict.DOUBTFUL, 50.0 + density / usual))
+        weight, remedy = 50.0 + density / usual, {f"platform.imu.{key}": float(f"{density:.3g}")}
+        findings.append(Finding("imu_noise", text, Verdict.DOUBTFUL, weight, remedy=remedy))
     return model, findings
+
+
+def with_measured_noise(site: Site, samples: ImuSamples) -> Site:
+    """Return a site whose declared noise of the IMU is replaced where the samples have far more."""
+    if not site.platform.inertial:
+        return site
+    model, _ = measured_noise(samples, site.platform.imu)
+    return with_white_noise(site, model.gyro_noise, model.accel_noise)
 
 
 # Called by a running estimator at every state.

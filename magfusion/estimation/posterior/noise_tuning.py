@@ -85,6 +85,14 @@ def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
     return tuple(replace(t, estimated=t.declared) for t in tuned)
 
 
+def compared_with(tuned: Sequence[Tuned], site: Site) -> tuple[Tuned, ...]:
+    """Return the noise with that of the IMU compared with what a site declares."""
+    imu = site.platform.imu
+    return tuple(
+        replace(t, declared=float(getattr(imu, t.key))) if t.key in OF_IMU else t for t in tuned
+    )
+
+
 def has_converged(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
     """Return whether two tunings differ by a negligible amount."""
     old = {(t.owner, t.key): t.estimated for t in before}

@@ -4,7 +4,7 @@ from collections.abc import Container, Iterator, Sequence
 
 import numpy as np
 
-from magfusion.estimation.posterior.noise_tuning import OF_MOTION, Tuned
+from magfusion.estimation.posterior.noise_tuning import OF_IMU, OF_MOTION, Tuned
 from magfusion.model.noise import model_error_cov
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -64,14 +64,7 @@ def tuned_noise(tuned: Sequence[Tuned], covered: Container[str] = ()) -> Iterato
             Verdict.TRUSTWORTHY,
         )
     if more:
-        yield Finding(
-            "noise_tuned",
-            f"Noise above the declared value: {_listed(more)}. Estimated values were used and"
-            " written to site.yaml. Check moments and position of the beacons listed, and iron and"
-            " machines near them; declare the remaining noise.",
-            Verdict.DOUBTFUL,
-            max(t.factor for t in more) / FACTOR,
-        )
+        yield _more(more)
     if less:
         yield Finding(
             "noise_tuned",
@@ -79,6 +72,20 @@ def tuned_noise(tuned: Sequence[Tuned], covered: Container[str] = ()) -> Iterato
             " written to site.yaml.",
             Verdict.TRUSTWORTHY,
         )
+
+
+def _more(more: Sequence[Tuned]) -> Finding:
+    text, weight = f"Noise above the declared value: {_listed(more)}.", max(t.factor for t in more)
+    used, remedy = "Estimated values were used and written to site.yaml", None
+    if all(t.key in OF_IMU for t in more):
+        text += f" {used}; declare them, or the values of the data sheet."
+        remedy = {f"platform.imu.{t.key}": float(f"{t.estimated:.3g}") for t in more}
+    else:
+        text += (
+            f" {used}. Check moments and position of the beacons listed, and iron and machines near"
+            " them; declare the remaining noise."
+        )
+    return Finding("noise_tuned", text, Verdict.DOUBTFUL, weight / FACTOR, remedy=remedy)
 
 
 def _listed(tuned: Sequence[Tuned]) -> str:
