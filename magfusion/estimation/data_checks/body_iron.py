@@ -7,11 +7,14 @@ rotation nothing is observable.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.estimation.data_checks.still_means import StillMeans
 from magfusion.estimation.data_checks.turning import CORRELATED
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -25,19 +28,49 @@ LIMIT = 8.5  # sigma of twelve numbers, 6 of one
 USUAL_MOUNTING = 0.1  # rad
 LEAST_SHARE = 0.01  # of the field's size, from which iron is reported
 EXPLAINED = 0.8  # share of the residual
+AS_WELL = 2.0  # ratio of what remains by a magnet to that by any iron, up to which it is a magnet
 # What a turn of the mounting does to matrix and offset, by its three components.
 _MOUNTING = np.zeros((12, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _MOUNTING[3 * _i + _j, _k], _MOUNTING[3 * _j + _i, _k] = -1.0, 1.0
 
 
-def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
-    """Yield the body-fixed iron that the declared calibration does not account for.
+class BodyIron(NamedTuple):
+    """Body-fixed iron: the static field that is measured is ``(1 + matrix) field + offset``."""
 
-    `means`: over spans of `IRON_SPAN`.
+    matrix_body: Array  # (3, 3); its antisymmetric part is a turn of the mounting
+    offset_body: Array  # (3,) (T)
+    cov: Array  # (12, 12), of the matrix, row by row, and the offset over the field's size
+    explained: float  # share of the residuals from one span to the next
+    size: float  # of the field (T)
+
+    @property
+    def symmetric_body(self) -> Array:
+        """Return the soft iron, (3, 3): the matrix without a turn of the mounting."""
+        return 0.5 * (self.matrix_body + self.matrix_body.T)
+
+    def undone(self, site: Site, *, soft: bool = True) -> Site:
+        """Return the site with its magnetometer calibrated; without `soft`, only its offset."""
+        sensor = site.platform.magnetometer
+        sensor_from_body = sensor.body_from_sensor.T
+        offset = sensor.offset + sensor.matrix @ sensor_from_body @ self.offset_body
+        matrix, within = sensor.matrix, sensor_from_body @ self.symmetric_body
+        if soft:
+            matrix = matrix @ (np.eye(3) + within @ sensor.body_from_sensor)
+        first, *others = site.platform.magnetometers
+        calibrated = replace(first, offset=offset, matrix=matrix)
+        platform = site.platform.with_magnetometers((calibrated, *others))
+        return replace(site, platform=platform)
+
+
+def fitted_iron(means: StillMeans, matrix_sigma: float = USUAL_MATRIX) -> BodyIron | None:
+    """Return the iron that explains the static field; None without enough rotation.
+
+    `means`: over spans of `IRON_SPAN`, by the declared calibration of the magnetometer.
+    `matrix_sigma`: of the soft iron; that of the declared matrix for a magnet alone.
     """
     if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
-        return
+        return None
     size = float(np.median(np.linalg.norm(means.field_body, axis=1)))
     following = np.diff(means.time) < 1.5 * IRON_SPAN
     field = means.field_body / size
@@ -45,23 +78,33 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     turn = np.swapaxes(attitude[1:], 1, 2) @ attitude[:-1]
     turn, before, after = turn[following], field[:-1][following], field[1:][following]
     if len(turn) < LEAST_STEPS:
-        return
+        return None
     angle = np.arccos(np.clip(0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
     if not np.sqrt(np.mean(angle**2)) > LEAST_TURN * IRON_SPAN:
-        return
+        return None
     residual = after - np.einsum("nij,nj->ni", turn, before)
-    result, cov, explained = _fitted(turn, before, residual)
-    sensor = site.platform.magnetometer.sigma
-    matrix, hard = result[:9].reshape(3, 3), result[9:]
-    soft = 0.5 * (matrix + matrix.T)
-    sigma = np.repeat([np.max(sensor.matrix), np.max(sensor.offset) / size], [9, 3])
+    result, cov, explained = _fitted(turn, before, residual, matrix_sigma)
+    return BodyIron(result[:9].reshape(3, 3), size * result[9:], cov, explained, size)
+
+
+def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
+    """Yield the body-fixed iron that the declared calibration does not account for.
+
+    `means`: over spans of `IRON_SPAN`.
+    """
+    iron = fitted_iron(means)
+    if iron is None:
+        return
+    soft, hard = iron.symmetric_body, iron.offset_body / iron.size
+    result, sensor = np.append(iron.matrix_body, hard), site.platform.magnetometer.sigma
+    sigma = np.repeat([np.max(sensor.matrix), np.max(sensor.offset) / iron.size], [9, 3])
     # A mounting error is not iron.
-    allowed = cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
+    allowed = iron.cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
     weight = float(np.sqrt(result @ np.linalg.solve(allowed, result)))
     share = max(float(np.max(np.abs(soft))), float(np.linalg.norm(hard)))
-    if not (weight > LIMIT and explained > EXPLAINED and share > LEAST_SHARE):
+    if not (weight > LIMIT and iron.explained > EXPLAINED and share > LEAST_SHARE):
         return
-    of_matrix, of_offset = float(np.sqrt(np.mean(soft**2))), size * float(np.linalg.norm(hard))
+    of_matrix, of_offset = float(np.sqrt(np.mean(soft**2))), float(np.linalg.norm(iron.offset_body))
     yield Finding(
         "body_iron",
         "magnetometer: the static field changes with attitude: uncalibrated iron or a magnet is on"
@@ -71,10 +114,26 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
         f" {max(of_matrix, 1e-3):.2g}, offset_t: {max(of_offset, 1e-8):.2g}.",
         Verdict.DOUBTFUL,
         150.0 + min(weight, 100.0),
+        remedy=changed_keys(site, calibrated(means, site)),
     )
 
 
-def _fitted(turn: Array, before: Array, residual: Array) -> tuple[Array, Array, float]:
+def calibrated(means: StillMeans, site: Site) -> Site:
+    """Return the site with the offset that explains the static field, and a matrix where it must.
+
+    `means`: as of `fitted_iron`; the field rotates enough.
+    """
+    known = float(np.max(site.platform.magnetometer.sigma.matrix))
+    magnet, iron = (fitted_iron(means, sigma) for sigma in (max(known, 1e-6), USUAL_MATRIX))
+    if magnet is None or iron is None:
+        return site
+    suffices = 1.0 - magnet.explained < AS_WELL * (1.0 - iron.explained)
+    return magnet.undone(site, soft=False) if suffices else iron.undone(site)
+
+
+def _fitted(
+    turn: Array, before: Array, residual: Array, matrix_sigma: float
+) -> tuple[Array, Array, float]:
     """Return matrix (9, row by row) and offset (3), their covariance, and the explained share.
 
     `turn` (n, 3, 3). `before`, `residual` (n, 3): fields in units of their size.
@@ -88,7 +147,7 @@ def _fitted(turn: Array, before: Array, residual: Array) -> tuple[Array, Array, 
     parts = [by_matrix.reshape(-1, 3, 9), by_offset, by_bias]
     design = np.concatenate(parts, axis=2).reshape(-1, 15)
     right = residual.ravel()
-    prior = np.repeat([USUAL_MATRIX, USUAL_OFFSET, USUAL_BIAS], [9, 3, 3]) ** -2.0
+    prior = np.repeat([matrix_sigma, USUAL_OFFSET, USUAL_BIAS], [9, 3, 3]) ** -2.0
     noise = 1e-4
     result, inverse = np.zeros(15), np.zeros((15, 15))
     for _ in range(3):

@@ -1,11 +1,11 @@
 """Checks of the raw streams of a log, independent of the estimator."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.data_checks.body_iron import IRON_SPAN, iron_on_body
+from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, iron_on_body
 from magfusion.estimation.data_checks.disturbing_lines import undeclared_lines
 from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
@@ -89,19 +89,53 @@ def recorded(
     result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
     log = beginning(log)
     # Of an unknown mounting the field and the gyroscope cannot be compared.
-    mounted = site is None or np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED
-    result += turned_otherwise(log, site) if log.inertial and mounted else []
-    if log.inertial and not any(finding.code in UNSTEADY for finding in result):
-        result += gravity_and_field_findings(log, site, poses, estimated)
+    mounted = site is None or bool(
+        np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED
+    )
+    turned = list(turned_otherwise(log, site)) if log.inertial and mounted else []
+    if log.inertial and not any(finding.code in UNSTEADY for finding in (*result, *turned)):
+        result += _steady_findings(log, site, turned, poses, estimated, mounted=mounted)
         if not any(finding.code in OF_GRAVITY for finding in result):
             result += truth_findings(log)
-        if site is not None and mounted and log.vectors is not None:
-            result += iron_on_body(still_means(log, site, IRON_SPAN), site)
+    else:
+        result += turned
     if beacons and site is not None and site.beacons:
         result += _of_beacons(log, site, detection, lockin, compensated)
     return tuple(
         replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in gap_bridged else f for f in result
     )
+
+
+def _steady_findings(
+    log: Log,
+    site: Site | None,
+    turned: Sequence[Finding],
+    poses: Trajectory | None,
+    estimated: Trajectory | None,
+    *,
+    mounted: bool,
+) -> list[Finding]:
+    """Return the findings on gravity and static field, without those that iron explains.
+
+    `turned`: those on their turn. `mounted`: whether the mounting of the magnetometer is known:
+    only then is iron tested.
+    """
+
+    def others(known: Site | None) -> Iterator[Finding]:
+        yield from turned if known is site else turned_otherwise(log, known)
+        yield from gravity_and_field_findings(log, known, poses, estimated)
+
+    result = list(others(site))
+    if site is None or not mounted or log.vectors is None:
+        return result
+    means = still_means(log, site, IRON_SPAN)
+    iron = list(iron_on_body(means, site))
+    if not iron or not result:
+        return [*result, *iron]
+    remaining = {finding.code for finding in others(calibrated(means, site))}
+    explained = tuple(sorted({finding.code for finding in result} - remaining))
+    kept = [finding for finding in result if finding.code in remaining]
+    return [*kept, *(replace(finding, explained=explained) for finding in iron)]
 
 
 def _of_beacons(

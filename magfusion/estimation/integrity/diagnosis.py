@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.body_iron import EXPLAINED, IRON_SPAN, fitted_iron
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
+from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.likely_cause import OF_MOTION, cause_of
 from magfusion.estimation.integrity.steel_test import STEEL
@@ -61,6 +63,9 @@ OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be be
 OF_CATCH_ALL = CAUSE_FIRST / 4.0
 
 
+MATRIX_OFF = "magnetometer_matrix"  # code
+
+
 class Diagnosis(NamedTuple):
     """The mistake that explains a log."""
 
@@ -108,21 +113,36 @@ def diagnosed(
     one, text = said
     if shown and one.code not in shown:
         return None
-    known = _diagnosis(one, text, trust.verdict, site, several=several)
+    parts = trust.verdict, log, site
+    known = _diagnosis(one, text, *parts, several=several)
     if not known.is_clear and is_steel:
         return None
     if one.rival is None:
         return known
-    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), trust.verdict, site, several=several)
+    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), *parts, several=several)
     return known._replace(rival=rival, rival_probability=one.rival_probability)
 
 
+def _with_offset(log: Log, site: Site) -> Site:
+    """Return a site whose magnetometer has the offset that its static field shows.
+
+    Iron on the body adds to the matrix, which the beacons' fields determine, a field of its own.
+    """
+    known = float(np.max(site.platform.magnetometer.sigma.matrix))
+    magnet = fitted_iron(still_means(log, site, IRON_SPAN), known)
+    if magnet is None or magnet.explained < EXPLAINED:
+        return site
+    return magnet.undone(site, soft=False)
+
+
 def _diagnosis(
-    one: Explanation, text: str, verdict: Verdict, declared: Site, *, several: bool
+    one: Explanation, text: str, verdict: Verdict, log: Log, declared: Site, *, several: bool
 ) -> Diagnosis:
     """Return an explanation as a finding; what several magnetometers share is not undone."""
     weight = OF_CATCH_ALL if one.catch_all else CAUSE_FIRST
     undone = None if several else one.site
+    if undone is not None and one.code == MATRIX_OFF:
+        undone = _with_offset(log, undone)
     remedy = None if undone is None else changed_keys(declared, undone)
     finding = Finding(one.code, text, verdict, weight, remedy=remedy or None)
     ratio = one.before / max(one.after, 1e-9)

@@ -1,0 +1,76 @@
+"""Iron and magnets on the body: how large they are, the remedy, and what they explain."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mistake_remedy import follow_remedy
+from spoiled_log import Recorded, field, good
+
+from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, fitted_iron
+from magfusion.estimation.data_checks.data_quality import recorded
+from magfusion.estimation.data_checks.still_means import still_means
+from magfusion.files.site import load_site, save_site
+from magfusion.model.trust import Finding
+from magfusion.units import Array
+
+MAGNET = np.array([2e-5, 0.0, -1e-5])  # T, sensor axes
+SOFT = 0.05 * np.array([[0.6, 0.8, -0.3], [0.8, -1.0, 0.5], [-0.3, 0.5, 0.4]])  # without a trace
+
+
+def magnet(seed: int = 0) -> Recorded:
+    return field(lambda v: v + MAGNET)(good("walk", seed))
+
+
+def iron(seed: int = 0) -> Recorded:
+    return field(lambda v: v @ (np.eye(3) + SOFT).T + 0.3 * MAGNET)(good("walk", seed))
+
+
+def finding(one: Recorded) -> Finding:
+    (found,) = (f for f in recorded(one.log, one.site) if f.code == "body_iron")
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_offset_of_a_magnet_is_found_and_no_matrix(seed: int) -> None:
+    one = magnet(seed)
+    site = calibrated(still_means(one.log, one.site, IRON_SPAN), one.site)
+    np.testing.assert_array_equal(
+        site.platform.magnetometer.matrix, one.site.platform.magnetometer.matrix
+    )
+    error = site.platform.magnetometer.offset - one.site.platform.magnetometer.offset - MAGNET
+    assert np.linalg.norm(error) < 2e-6  # T
+
+
+def test_of_soft_iron_the_matrix_is_found_too() -> None:
+    """But for a common scale, which no rotation shows."""
+    one = iron()
+    site = calibrated(still_means(one.log, one.site, IRON_SPAN), one.site)
+    before: Array = one.site.platform.magnetometer.matrix
+    matrix = np.linalg.solve(before, site.platform.magnetometer.matrix) - np.eye(3)
+    np.testing.assert_allclose(matrix - np.trace(matrix) / 3.0 * np.eye(3), SOFT, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("one", [magnet(), iron()], ids=["magnet", "iron"])
+def test_the_remedy_followed_leaves_nothing_to_report(one: Recorded, tmp_path: Path) -> None:
+    save_site(one.site, tmp_path / "site.yaml")
+    remedy = finding(one).remedy
+    assert remedy
+    follow_remedy(tmp_path / "site.yaml", remedy, tmp_path / "other.yaml")
+    other = replace(one, site=load_site(tmp_path / "other.yaml"))
+    codes = {f.code for f in recorded(other.log, other.site)}
+    assert not codes & {"body_iron", "gyro_field", "earth_field", "mounting"}
+
+
+def test_what_a_magnet_explains_is_not_reported_beside_it() -> None:
+    one = magnet()
+    found = finding(one)
+    codes = [f.code for f in recorded(one.log, one.site)]
+    assert found.explained
+    assert not set(found.explained) & set(codes)
+
+
+def test_without_rotation_no_iron_is_fitted() -> None:
+    one = field(lambda v: v + MAGNET)(good("static"))
+    assert fitted_iron(still_means(one.log, one.site, IRON_SPAN)) is None
