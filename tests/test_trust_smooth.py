@@ -93,7 +93,7 @@ WRONG: dict[str, tuple[Callable[[Site], Site], str, str]] = {
     "lever arm 20 cm off": (lever_arm_off, "lever_arm", "lever arm"),
     "mounting 10 degrees off": (mounting_off, "mounting", "mounting"),
     "a beacon moved by 5 cm": (beacon_moved, "beacon_pose", "beacon A"),
-    "moments given as rms": (moments_rms, "moments", "1.4"),
+    "moments given as rms": (moments_rms, "field_scale", "1.4"),
     "a survey declared too good": (survey_overconfident, "prior", "position"),
 }
 

@@ -175,7 +175,10 @@ def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault]
         block = cause.fault.blocks[0]
         factor = float(np.exp(block.sigma * cause.step[block.columns])[0])
         result = f"all are {factor:.3g} times as large"
-        remedy = "Correct them (peak, not rms; their unit), or declare their sigma"
+        remedy = (
+            "Correct the moments (peak, not rms; their unit) or the magnetometer's matrix, which"
+            " have the same effect, or declare their sigma"
+        )
     elif cause.fault.code == TILT:
         size = np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0]
         tilt = -np.rad2deg(TYPICAL_TILT * size)  # the step takes it back

@@ -151,6 +151,7 @@ CODE: dict[Parameter, str] = {
 
 LEVER_ARM = "the lever arm of the magnetometer"
 TILT, STRETCH, SAMPLE_RATE = "survey_tilt", "survey_scale", "sample_rate"
+FIELD_SCALE = "field_scale"
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
 # seldom tilted, and gyros seldom are that bad.
 RARE = 0.1
@@ -237,8 +238,9 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
 
 def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]:
     """Yield what would have a number of all beacons wrong alike."""
-    scale = f"the scale of the moments of {_beacons(site)}"
-    kinds: dict[str, tuple[Parameter, str]] = {scale: (LOG_MOMENT, "")}
+    # That of the magnetometer has the same effect.
+    scale = f"the scale of the fields of {_beacons(site)}"
+    kinds: dict[str, tuple[Parameter, str]] = {scale: (LOG_MOMENT, FIELD_SCALE)}
     if not site.platform.further:
         kinds["the sampling rate of the magnetometer"] = (DRIFT, SAMPLE_RATE)
     for name, (parameter, code) in kinds.items():
