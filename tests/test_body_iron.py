@@ -8,9 +8,11 @@ import pytest
 from mistake_remedy import follow_remedy
 from spoiled_log import Recorded, field, good
 
+from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, fitted_iron
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.data_checks.still_means import still_means
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.files.site import load_site, save_site
 from magfusion.model.trust import Finding
 from magfusion.units import Array
@@ -74,3 +76,15 @@ def test_what_a_magnet_explains_is_not_reported_beside_it() -> None:
 def test_without_rotation_no_iron_is_fitted() -> None:
     one = field(lambda v: v + MAGNET)(good("static"))
     assert fitted_iron(still_means(one.log, one.site, IRON_SPAN)) is None
+
+
+@pytest.mark.slow
+def test_a_magnet_is_the_only_reason_and_widens_no_pose() -> None:
+    """The static field is compared with the Earth's without it."""
+    sigma = []
+    for one in (magnet(), good("walk", 0)):
+        result, trust = judge_result(smooth(one.log, one.site), one.log)
+        assert {f.code for f in trust.reasons} <= {"body_iron"}
+        assert result.states.pose_cov is not None
+        sigma.append(np.sqrt(np.mean(result.states.pose_cov[:, :3, :3].trace(axis1=1, axis2=2))))
+    assert sigma[0] == pytest.approx(sigma[1], rel=0.1)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, iron_on_body
 from magfusion.estimation.data_checks.data_quality import beginning
 from magfusion.estimation.data_checks.statistics import (
     TEST_BUDGET,
@@ -331,13 +332,20 @@ def together(case: Case) -> TestResult:
 
 
 def compass(case: Case) -> TestResult:
-    """Test the static field at the poses, and doubt the poses of the spans where it differs."""
+    """Test the static field at the poses, and doubt the poses of the spans where it differs.
+
+    Without that of iron on the body, which is reported by itself.
+    """
     site, states, log = case.result.declared.site, case.result.states, case.log
     if case.result.earth_residual is not None or site.earth_field_world is None:
         return NOTHING
     if log.vectors is None or len(site.platform.magnetometer.axes) < 3 or not len(states):
         return NOTHING
-    means = still_means(beginning(log), site)
+    log = beginning(log)
+    short = still_means(log, site, IRON_SPAN)
+    if any(iron_on_body(short, site)):
+        site = calibrated(short, site)
+    means = still_means(log, site)
     near, row, attitude = means.near(states, NEAR)
     field_body = means.field_body[near]
     if len(row) < SPANS_TOGETHER or not np.all(np.isfinite(field_body)):
