@@ -49,7 +49,7 @@ class BodyIron(NamedTuple):
         """Return the soft iron, (3, 3): the matrix without a turn of the mounting."""
         return 0.5 * (self.matrix_body + self.matrix_body.T)
 
-    def undone(self, site: Site, *, soft: bool = True) -> Site:
+    def compensated_in(self, site: Site, *, soft: bool = True) -> Site:
         """Return the site with its magnetometer calibrated; without `soft`, only its offset."""
         sensor = site.platform.magnetometer
         sensor_from_body = sensor.body_from_sensor.T
@@ -128,7 +128,7 @@ def calibrated(means: StillMeans, site: Site) -> Site:
     if magnet is None or iron is None:
         return site
     suffices = 1.0 - magnet.explained < AS_WELL * (1.0 - iron.explained)
-    return magnet.undone(site, soft=False) if suffices else iron.undone(site)
+    return magnet.compensated_in(site, soft=False) if suffices else iron.compensated_in(site)
 
 
 def _fitted(

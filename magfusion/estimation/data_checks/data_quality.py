@@ -92,13 +92,13 @@ def recorded(
     mounted = site is None or bool(
         np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED
     )
-    turned = list(turned_otherwise(log, site)) if log.inertial and mounted else []
-    if log.inertial and not any(finding.code in UNSTEADY for finding in (*result, *turned)):
-        result += _steady_findings(log, site, turned, poses, estimated, mounted=mounted)
+    of_turn = list(turned_otherwise(log, site)) if log.inertial and mounted else []
+    if log.inertial and not any(finding.code in UNSTEADY for finding in (*result, *of_turn)):
+        result += _steady_findings(log, site, of_turn, poses, estimated, mounted=mounted)
         if not any(finding.code in OF_GRAVITY for finding in result):
             result += truth_findings(log)
     else:
-        result += turned
+        result += of_turn
     if beacons and site is not None and site.beacons:
         result += _of_beacons(log, site, detection, lockin, compensated)
     return tuple(
@@ -109,7 +109,7 @@ def recorded(
 def _steady_findings(
     log: Log,
     site: Site | None,
-    turned: Sequence[Finding],
+    of_turn: Sequence[Finding],
     poses: Trajectory | None,
     estimated: Trajectory | None,
     *,
@@ -117,12 +117,12 @@ def _steady_findings(
 ) -> list[Finding]:
     """Return the findings on gravity and static field, without those that iron explains.
 
-    `turned`: those on their turn. `mounted`: whether the mounting of the magnetometer is known:
-    only then is iron tested.
+    `of_turn`: those on their rotation. `mounted`: whether the mounting of the magnetometer is
+    known: only then is iron tested.
     """
 
     def others(known: Site | None) -> Iterator[Finding]:
-        yield from turned if known is site else turned_otherwise(log, known)
+        yield from of_turn if known is site else turned_otherwise(log, known)
         yield from gravity_and_field_findings(log, known, poses, estimated)
 
     result = list(others(site))

@@ -132,7 +132,7 @@ def _with_offset(log: Log, site: Site) -> Site:
     magnet = fitted_iron(still_means(log, site, IRON_SPAN), known)
     if magnet is None or magnet.explained < EXPLAINED:
         return site
-    return magnet.undone(site, soft=False)
+    return magnet.compensated_in(site, soft=False)
 
 
 def _diagnosis(
