@@ -50,16 +50,19 @@ def notes_of(trust: Trust) -> Figures:
 
 
 def _one_of_each(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
-    """Return the findings with those of one code, as of several axes or beacons, in one text."""
+    """Return one finding of each code, as of several axes or beacons, with all their remedies."""
     of_code: dict[str, list[Finding]] = {}
     for finding in findings:
         of_code.setdefault(finding.code, []).append(finding)
     result = []
-    for first, *others in of_code.values():
-        texts = [one.text for one in (first, *others[: MOST_TEXTS - 1])]
-        more = len(others) - (MOST_TEXTS - 1)
-        texts += [f"And {more} more of this kind."] if more > 0 else []
-        result.append(replace(first, text=" ".join(texts)))
+    for every in of_code.values():
+        texts = list(dict.fromkeys(one.text for one in every))
+        more = len(texts) - MOST_TEXTS
+        text = " ".join([*texts[:MOST_TEXTS], *([f"And {more} more of this kind."] * (more > 0))])
+        # That of the most important one, where two are of one key.
+        remedy = {k: v for one in reversed(every) for k, v in (one.remedy or {}).items()}
+        explained = tuple(dict.fromkeys(code for one in every for code in one.explained))
+        result.append(replace(every[0], text=text, remedy=remedy or None, explained=explained))
     return tuple(result)
 
 
