@@ -6,7 +6,7 @@ from magfusion.model.trust import Finding, Trust
 from magfusion.results.verdict import MOST_TEXTS, trust_figures
 
 
-def reasons(*findings: Finding) -> list[dict[str, Any]]:
+def reasons(*findings: Finding) -> list[Any]:
     rows = trust_figures(Trust(findings))["reasons"]
     assert isinstance(rows, list)
     return rows

@@ -95,8 +95,8 @@ class LossRecovery:
             self._pointing.over()
             if not is_curved(measured.phasors, state):
                 return measured, None, nothing
-            at = relinearized(measured.phasors, state, self._blocks)
-            return measured if at is None else replace(measured, phasors=at), None, nothing
+            phasors = self._relinearized(measured.phasors, state)
+            return replace(measured, phasors=phasors), None, nothing
         if not self._pointing.due(state.time):
             return measured, None, samples.valid[0]
         fix = agreed_fix(samples, state.calibration, prior_of(state))
@@ -107,6 +107,14 @@ class LossRecovery:
         self._gate.counts["found by a fix"] += 1
         self._pointing.over()
         return measured, at_fix(state, fix), fix.refused
+
+    def _relinearized(self, phasors: FieldPhasors, state: State) -> FieldPhasors:
+        """Return fields linearised at the most probable pose, without those of false beacons."""
+        plausible = phasors.without(self._gate.beyond(phasors, state))
+        at = relinearized(plausible, state, self._blocks)
+        if at is None or at.world_from_body is None or at.position_world is None:
+            return phasors
+        return phasors.linearized_at(at.world_from_body[0], at.position_world[0])
 
 
 def _wide(state: State) -> bool:

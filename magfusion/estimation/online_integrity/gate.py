@@ -82,7 +82,7 @@ class Gate:
         `measurements`: of one epoch. `valid`, `refused` (channels,): channels that the epoch
         contains, and those that are already rejected.
         """
-        distance = measurements.alone().distances(state, self.blocks, self._limit)
+        distance = self._distance(measurements, state)
         beyond: BoolArray = np.asarray(distance > self._limit)
         false = self.watch.update(beyond, valid)
         rejected: BoolArray = np.asarray(beyond | refused | false) & valid
@@ -99,6 +99,13 @@ class Gate:
         outvoted = len(self.refused.keys() - self.accepted.keys()) >= max(1, len(self.accepted))
         self.outvoted_in_a_row = self.outvoted_in_a_row + 1 if outvoted else 0
         return measurements.without(rejected) if np.any(rejected) else measurements
+
+    def beyond(self, phasors: FieldPhasors, state: State) -> BoolArray:
+        """Return which channels a state does not explain, (channels,)."""
+        return np.asarray(self._distance(phasors, state) > self._limit)
+
+    def _distance(self, measurements: Phasors, state: State) -> Array:
+        return measurements.alone().distances(state, self.blocks, self._limit)
 
     def nothing_measured(self) -> None:
         """Record an epoch without field."""
