@@ -174,10 +174,14 @@ def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault]
     elif len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
         block = cause.fault.blocks[0]
         factor = float(np.exp(block.sigma * cause.step[block.columns])[0])
-        result = f"all are {factor:.3g} times as large"
+        longer = 100.0 * (factor ** (1.0 / 3.0) - 1.0)  # the field falls with the cube
+        result = (
+            f"all are {factor:.3g} times as large, or all distances of the survey"
+            f" {longer:+.2g} % too long"
+        )
         remedy = (
-            "Correct the moments (peak, not rms; their unit) or the magnetometer's matrix, which"
-            " have the same effect, or declare their sigma"
+            "Correct the moments (peak, not rms; their unit), the magnetometer's matrix or the"
+            " survey's unit, which have the same effect, or declare their sigma"
         )
     elif cause.fault.code == TILT:
         size = np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0]
