@@ -66,6 +66,11 @@ SPOILED: dict[str, tuple[Change, tuple[str, ...], str]] = {
     "field permuted": (field(lambda v: v[:, [1, 2, 0]]), ("mounting",), "120 deg"),
     "field held": (field(fixed(2)), ("repeated_samples",), "50 %"),
     "field limited": (field(limited(0.9)), ("saturated",), "is saturated at"),
+    "field wraps": (
+        field(lambda v: (v + 3e-5) % 6e-5 - 3e-5),
+        ("saturated",),
+        "its converter overflows",
+    ),
     "field axis dead": (field(stuck(2, 1e-5)), ("stuck_axis",), "axis z frozen at 10 uT"),
     "field iron": (
         field(lambda v: v + np.array([9e-6, -6e-6, 3e-6])),

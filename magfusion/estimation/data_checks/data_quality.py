@@ -10,7 +10,12 @@ from magfusion.estimation.data_checks.disturbing_lines import undeclared_lines
 from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
 from magfusion.estimation.data_checks.pauses import repeated_samples
-from magfusion.estimation.data_checks.samples import clipped_samples, false_samples, frozen_samples
+from magfusion.estimation.data_checks.samples import (
+    clipped_samples,
+    false_samples,
+    frozen_samples,
+    wrapped_samples,
+)
 from magfusion.estimation.data_checks.signal import (
     BeaconDetection,
     Detected,
@@ -37,6 +42,7 @@ SAMPLE_TESTS: tuple[SampleTest, ...] = (
     frozen_samples,
     repeated_samples,
     clipped_samples,
+    wrapped_samples,
     false_samples,
     noisy_inertial,
 )

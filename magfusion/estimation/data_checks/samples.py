@@ -30,6 +30,9 @@ SHORTEST_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch i
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
+LEAST_WRAPS = 2
+AT_END = 0.9  # of the largest value
+SLOW = 0.1  # of it; steps of an axis that follows the field or the motion
 LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
 SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
@@ -199,6 +202,35 @@ def _clipped_axes(stream: InstrumentStream, site: Site | None) -> Iterator[Findi
             " avoid the motion or field that exceeds it.",
             weight=500.0 + 100.0 * share,
         )
+
+
+def wrapped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
+    """Yield the axes whose converter overflows from one end of its range to the other."""
+    for stream in streams(log):
+        for axis in range(len(stream.axes)):
+            value = stream.value[:, axis]
+            at = wraps(value)
+            if len(at) < LEAST_WRAPS:
+                continue
+            limit = float(np.max(np.abs(value)))
+            yield Finding(
+                "saturated",
+                f"{stream.name}: axis {stream.axes[axis]} jumps from one end of its range to the"
+                f" other, +-{limit * stream.scale:.4g} {stream.unit}, {len(at)} times, first at"
+                f" {stream.time[at[0]]:.2f} s: its converter overflows. Select a larger range, or"
+                " avoid the motion or field that exceeds it.",
+                weight=600.0,
+            )
+
+
+def wraps(value: Array) -> IntArray:
+    """Return the samples (n,) from which an axis jumps across its range; none where it is fast."""
+    limit = float(np.max(np.abs(value), initial=0.0))
+    step, at_end = np.abs(np.diff(value)), np.abs(value) > AT_END * limit
+    across = (step > 2.0 * AT_END * limit) & at_end[:-1] & at_end[1:]
+    if not np.any(across) or np.quantile(step[~across], 0.99) > SLOW * limit:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(across)
 
 
 def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
