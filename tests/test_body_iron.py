@@ -45,6 +45,15 @@ def test_the_offset_of_a_magnet_is_found_and_no_matrix(seed: int) -> None:
     assert np.linalg.norm(error) < 2e-6  # T
 
 
+def test_a_matrix_declared_to_be_exact_is_kept() -> None:
+    one = magnet()
+    sensor = one.site.platform.magnetometer
+    exact = replace(sensor, sigma=replace(sensor.sigma, matrix=np.zeros((3, 3))))
+    site = replace(one.site, platform=one.site.platform.with_magnetometers((exact,)))
+    offset = calibrated(still_means(one.log, site, IRON_SPAN), site).platform.magnetometer.offset
+    assert np.linalg.norm(offset - sensor.offset - MAGNET) < 2e-6  # T
+
+
 def test_of_soft_iron_the_matrix_is_found_too() -> None:
     """But for a common scale, which no rotation shows."""
     one = iron()

@@ -11,6 +11,8 @@ from magfusion.estimation.integrity.inertial_misfit import expected_squares, ine
 from magfusion.estimation.integrity.residual_blocks import TOLERATED_INERTIAL
 from magfusion.estimation.integrity.score import moved_estimate, scores_of
 from magfusion.model.parameters.inertial import GYRO_SCALE
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import Array
@@ -19,21 +21,25 @@ ROWS = [0, 1, 2, 6, 7, 8]  # gyro and accelerometer
 BENT = 0.01  # of the fields, constant in place
 
 
+def a_walk(site: Site, seed: int, random_field: float = 0.0) -> Log:
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD,
+        duration=24.0,
+        motion="walk",
+        turn_rate=3.0,
+        magnetometer_rate_hz=250.0,
+        random_field=random_field,
+    )
+    return simulate_log(site, config, np.random.default_rng(seed)).log
+
+
 @pytest.mark.slow
 def test_errors_constant_in_place_are_expected_to_turn_the_states_slowly() -> None:
     """They leave more than white errors of their size would, in each of several worlds."""
     ratios = []
     for seed in range(4):
         site = replace(demo_site(coil_radius=None), model_error=BENT)
-        config = SimulationConfig(
-            box_world=DEMO_BOX_WORLD,
-            duration=24.0,
-            motion="walk",
-            turn_rate=3.0,
-            magnetometer_rate_hz=250.0,
-            random_field=BENT,
-        )
-        log = simulate_log(site, config, np.random.default_rng(seed)).log
+        log = a_walk(site, seed, random_field=BENT)
         result = smooth(log, site, SmootherSettings(loss="cauchy"))
         square = np.mean(inertial_errors(result, result.estimate) ** 2, axis=0)
         ratios.append((square / expected_squares(result))[ROWS])
@@ -44,15 +50,8 @@ def test_errors_constant_in_place_are_expected_to_turn_the_states_slowly() -> No
 @pytest.mark.slow
 def test_a_step_of_the_gyro_scale_moves_states_and_inertial_data_together() -> None:
     """A gyro whose scale is 3 % off: what the step to 3 % leaves is noise, with its data moved."""
-    config = SimulationConfig(
-        box_world=DEMO_BOX_WORLD,
-        duration=24.0,
-        motion="walk",
-        turn_rate=3.0,
-        magnetometer_rate_hz=250.0,
-    )
     site = demo_site(coil_radius=None)
-    log = simulate_log(site, config, np.random.default_rng(3)).log
+    log = a_walk(site, 3)
     log = replace(log, imu=replace(log.imu, gyro_body=1.03 * log.imu.gyro_body))
     result = smooth(log, site, SmootherSettings())
     scores = scores_of(result, log.imu)

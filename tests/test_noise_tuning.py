@@ -121,6 +121,13 @@ def test_a_tenth_of_the_noise_declared_is_reported_and_the_sigmas_are_right(log:
 
 
 @pytest.mark.slow
+def test_the_noise_of_the_samples_is_reported_where_none_is_tuned(log: Log) -> None:
+    settings = SmootherSettings(coupling="loose", loss=None)
+    _, trust = judge_result(smooth(log, declared(imu=0.1), settings), log)
+    assert {f.code for f in trust.reasons} & {"noise_tuned", "imu_noise"}
+
+
+@pytest.mark.slow
 def test_what_is_declared_too_large_of_the_imu_stays(log: Log) -> None:
     """Scale and vibration may be in it, which are not white."""
     result = smooth(log, declared(imu=3.0))

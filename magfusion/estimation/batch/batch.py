@@ -213,7 +213,7 @@ def _solved(
         move = last_move(before.states, result.states, unfinished)
     return replace(
         result,
-        noise=compared_with(now.tuned, first.site),
+        noise=compared_with(now.tuned, first.site, prior),
         standing=now.standing,
         iteration_count=now.done,
         iterations=now.iterations,

@@ -28,6 +28,7 @@ LIMIT = 8.5  # sigma of twelve numbers, 6 of one
 USUAL_MOUNTING = 0.1  # rad
 LEAST_SHARE = 0.01  # of the field's size, from which iron is reported
 EXPLAINED = 0.8  # share of the residual
+EXACT = 1e-6  # sigma of a matrix that is declared to be exact
 AS_WELL = 2.0  # ratio of what remains by a magnet to that by any iron, up to which it is a magnet
 # What a turn of the mounting does to matrix and offset, by its three components.
 _MOUNTING = np.zeros((12, 3))
@@ -67,7 +68,7 @@ def fitted_iron(means: StillMeans, matrix_sigma: float = USUAL_MATRIX) -> BodyIr
     """Return the iron that explains the static field; None without enough rotation.
 
     `means`: over spans of `IRON_SPAN`, by the declared calibration of the magnetometer.
-    `matrix_sigma`: of the soft iron; that of the declared matrix for a magnet alone.
+    `matrix_sigma`: of the soft iron.
     """
     if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
         return None
@@ -85,6 +86,12 @@ def fitted_iron(means: StillMeans, matrix_sigma: float = USUAL_MATRIX) -> BodyIr
     residual = after - np.einsum("nij,nj->ni", turn, before)
     result, cov, explained = _fitted(turn, before, residual, matrix_sigma)
     return BodyIron(result[:9].reshape(3, 3), size * result[9:], cov, explained, size)
+
+
+def fitted_magnet(means: StillMeans, site: Site) -> BodyIron | None:
+    """Return the same with a matrix that is known as well as declared: a magnet alone."""
+    known = float(np.max(site.platform.magnetometer.sigma.matrix))
+    return fitted_iron(means, max(known, EXACT))
 
 
 def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
@@ -123,8 +130,7 @@ def calibrated(means: StillMeans, site: Site) -> Site:
 
     `means`: as of `fitted_iron`; the field rotates enough.
     """
-    known = float(np.max(site.platform.magnetometer.sigma.matrix))
-    magnet, iron = (fitted_iron(means, sigma) for sigma in (max(known, 1e-6), USUAL_MATRIX))
+    magnet, iron = fitted_magnet(means, site), fitted_iron(means)
     if magnet is None or iron is None:
         return site
     suffices = 1.0 - magnet.explained < AS_WELL * (1.0 - iron.explained)

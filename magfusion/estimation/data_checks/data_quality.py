@@ -95,9 +95,7 @@ def recorded(
     result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
     log = beginning(log)
     # Of an unknown mounting the field and the gyroscope cannot be compared.
-    mounted = site is None or bool(
-        np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED
-    )
+    mounted = site is None or is_mounted(site)
     of_turn = list(turned_otherwise(log, site)) if log.inertial and mounted else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in (*result, *of_turn)):
         result += _steady_findings(log, site, of_turn, poses, estimated, mounted=mounted)
@@ -110,6 +108,11 @@ def recorded(
     return tuple(
         replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in gap_bridged else f for f in result
     )
+
+
+def is_mounted(site: Site) -> bool:
+    """Return whether the mounting of the magnetometer is known, so that iron can be tested."""
+    return bool(np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED)
 
 
 def _steady_findings(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.body_iron import EXPLAINED, IRON_SPAN, fitted_iron
+from magfusion.estimation.data_checks.body_iron import EXPLAINED, IRON_SPAN, fitted_magnet
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.integrity.explanation import Explanation
@@ -128,8 +128,7 @@ def _with_offset(log: Log, site: Site) -> Site:
 
     Iron on the body adds to the matrix, which the beacons' fields determine, a field of its own.
     """
-    known = float(np.max(site.platform.magnetometer.sigma.matrix))
-    magnet = fitted_iron(still_means(log, site, IRON_SPAN), known)
+    magnet = fitted_magnet(still_means(log, site, IRON_SPAN), site)
     if magnet is None or magnet.explained < EXPLAINED:
         return site
     return magnet.compensated_in(site, soft=False)

@@ -33,7 +33,7 @@ class InertialColumns(NamedTuple):
 
     def moved(self, step: Array) -> Array:
         """Return the change of the errors by a step of all columns (number,), (intervals, 15)."""
-        return np.einsum("nrb,nbk,k->nr", self.of_bias, self.bias, step[self.at])
+        return np.asarray((self.of_bias @ (self.bias @ step[self.at])[..., None])[..., 0])
 
     def part(self, columns: slice) -> "InertialColumns":
         """Return a subset of the columns."""

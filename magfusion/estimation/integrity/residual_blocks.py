@@ -14,7 +14,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, iron_on_body
-from magfusion.estimation.data_checks.data_quality import beginning
+from magfusion.estimation.data_checks.data_quality import beginning, is_mounted
 from magfusion.estimation.data_checks.statistics import (
     TEST_BUDGET,
     effective_number,
@@ -343,7 +343,7 @@ def compass(case: Case) -> TestResult:
         return NOTHING
     log = beginning(log)
     short = still_means(log, site, IRON_SPAN)
-    if any(iron_on_body(short, site)):
+    if is_mounted(site) and any(iron_on_body(short, site)):
         site = calibrated(short, site)
     means = still_means(log, site)
     near, row, attitude = means.near(states, NEAR)

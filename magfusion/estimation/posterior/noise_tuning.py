@@ -85,11 +85,18 @@ def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
     return tuple(replace(t, estimated=t.declared) for t in tuned)
 
 
-def compared_with(tuned: Sequence[Tuned], site: Site) -> tuple[Tuned, ...]:
-    """Return the noise with that of the IMU compared with what a site declares."""
-    imu = site.platform.imu
-    return tuple(
-        replace(t, declared=float(getattr(imu, t.key))) if t.key in OF_IMU else t for t in tuned
+def compared_with(tuned: Sequence[Tuned], declared: Site, used: Site) -> tuple[Tuned, ...]:
+    """Return the noise with that of the IMU compared with what the user declares.
+
+    `used`: the site of the first pass, whose noise of the IMU may be that of the samples; what is
+    not tuned keeps it.
+    """
+    imu, own = declared.platform.imu, used.platform.imu
+    known = {t.key for t in tuned}
+    kept = [key for key in OF_IMU if key not in known and getattr(own, key) != getattr(imu, key)]
+    return (
+        *(replace(t, declared=float(getattr(imu, t.key))) if t.key in OF_IMU else t for t in tuned),
+        *(Tuned("imu", key, float(getattr(imu, key)), float(getattr(own, key))) for key in kept),
     )
 
 
