@@ -169,10 +169,15 @@ def _no_field(log: Path) -> None:
     (log / "fields.parquet").unlink()
 
 
+def _nothing_of_ours(log: Path) -> None:
+    _no_field(log)
+    (log / "log.yaml").unlink()
+
+
 IMU = "time_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 
 BAD_DIRECTORIES: list[tuple[Callable[[Path], object], str]] = [
-    (lambda log: (log / "log.yaml").unlink(), "holds no log.yaml"),
+    (_nothing_of_ours, "holds no log.yaml, nor a table magnetometer or fields"),
     (_no_field, "holds no magnetometer.parquet and no fields.parquet"),
     (lambda log: (log / "imu.csv").write_text(IMU), "holds imu.parquet and imu.csv; keep one"),
     (_header(magfusion_log=2), r"log.yaml: magfusion_log: found 2"),

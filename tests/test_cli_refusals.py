@@ -75,7 +75,7 @@ def test_a_truncated_or_empty_table_is_refused_by_name(
 
 
 @pytest.mark.parametrize("job", JOBS)
-@pytest.mark.parametrize("missing", ["", "log.yaml", "magnetometer.parquet"])
+@pytest.mark.parametrize("missing", ["", "magnetometer.parquet"])
 def test_a_missing_file_is_refused_by_name(
     job: str, missing: str, log: Path, tmp_path: Path, refuse: Refuse
 ) -> None:

@@ -475,7 +475,7 @@ def test_the_kind_of_a_log_is_seen_from_its_files(tmp_path: Path) -> None:
     (tmp_path / "old.bag").write_text("#ROSBAG V2.0")
     for name, sentence in (
         ("nowhere", "there is no such file or directory"),
-        ("photos", "is no log: found neither log.yaml, nor mav0"),
+        ("photos", "is no log: found neither log.yaml nor the tables of a log"),
         ("old.bag", "cannot be read .*record the bag again"),
     ):
         with pytest.raises(InputError, match=f"{name}: {sentence}"):

@@ -14,6 +14,7 @@ from example_log import EPOCH_NS, example_fields, example_log, example_trajector
 from magfusion.errors import InputError
 from magfusion.files.fields import order_channels
 from magfusion.files.log import read_log, write_log
+from magfusion.files.open import open_log
 from magfusion.files.table import ROWS_PER_GROUP
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.model.samples import ImuSamples, Log
@@ -211,6 +212,26 @@ def test_a_failed_write_leaves_the_former_log_and_nothing_else(
         write_log(example_log(seed=2), tmp_path / "walk")
     _assert_same(read_log(tmp_path / "walk"), log)
     assert [p.name for p in tmp_path.iterdir()] == ["walk"]
+
+
+@pytest.mark.parametrize("table", ["magnetometer", "fields"])
+def test_tables_without_a_header_are_a_log_whose_time_begins_with_them(
+    table: str, tmp_path: Path
+) -> None:
+    log, directory = example_log(), tmp_path / "walk"
+    write_log(log, directory)
+    (directory / "log.yaml").unlink()
+    (directory / f"{'fields' if table == 'magnetometer' else 'magnetometer'}.parquet").unlink()
+    _as_csv(directory)
+    result = open_log(directory)
+    stream = result.waveform if table == "magnetometer" else result.fields
+    assert stream is not None
+    assert stream.time[0] == 0.0
+    assert result.name == "walk"
+    later = 1e-9 * (result.epoch_ns - log.epoch_ns)
+    np.testing.assert_allclose(result.imu.time + later, log.imu.time, rtol=0.0, atol=1e-9)  # s
+    with pytest.raises(InputError, match="walk: holds other files"):  # nobody's but the user's
+        write_log(log, directory)
 
 
 def test_a_log_replaces_a_log_but_keeps_the_site_beside_it(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ ROOMS = {
             attitude_table audio distances drive_columns fields hall instruments
             site_casing site_correlation site_motion site_region site_rotor
             site_temperature
-            row_stamps steel_file steel_map trajectory_table wells_file
+            log_header row_stamps steel_file steel_map trajectory_table wells_file
             bag fix_table marks_table readings_table result_states
             site_plain site_text
             aiding_tables record_values site_response tum

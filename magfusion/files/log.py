@@ -3,10 +3,8 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import pyarrow as pa
-from pydantic import Field
 
 from magfusion.errors import InputError
 from magfusion.files.aiding_tables import read_aiding, write_aiding
@@ -21,6 +19,7 @@ from magfusion.files.inertial_tables import (
     write_imu,
     write_waveform,
 )
+from magfusion.files.log_header import HEADER, has_header, is_log, read_header
 from magfusion.files.marks_table import read_marks, write_marks
 from magfusion.files.named_samples import names_magnetometers, read_waveforms, write_waveforms
 from magfusion.files.readings_table import (
@@ -30,36 +29,20 @@ from magfusion.files.readings_table import (
     read_temperatures,
     write_readings,
 )
-from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
+from magfusion.files.table import Span, find_table
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
-from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.files.yaml_files import write_yaml
 from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 
-HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
 STREAMS = (
     *("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference", "depth"),
     *QUANTITIES,
 )
-
-
-class LogHeader(StrictModel):
-    """What ``log.yaml`` holds."""
-
-    magfusion_log: Literal[1]
-    name: str
-    epoch_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
-    source: str
-    audio: AudioEntry | None = None
-
-
-def is_log(path: Path) -> bool:
-    """Return whether a directory has the header of a magfusion log."""
-    return (path / HEADER).is_file()
 
 
 def _tables(path: Path, audio: AudioEntry | None) -> dict[str, Path | None]:
@@ -83,7 +66,7 @@ def read_log(
     Parameters
     ----------
     path : Path
-        A directory with ``log.yaml`` and a table per stream, Parquet or CSV.
+        A directory with a table per stream, Parquet or CSV, and ``log.yaml``; see `read_header`.
     start, end : float, optional
         Seconds since the log's epoch. Rows outside are neither decoded nor checked.
     site : Site, optional
@@ -99,8 +82,11 @@ def read_log(
         result = "is a file" if path.exists() else "there is no such directory"
         raise InputError(f"{path}: {result}; give the path of a log's directory.")
     if not is_log(path):
-        raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
-    header = read_yaml(path / HEADER, LogHeader)
+        raise InputError(
+            f"{path}: holds no {HEADER}, nor a table magnetometer or fields with the columns of a"
+            " log; give the path of a log's directory."
+        )
+    header = read_header(path)
     tables = _tables(path, header.audio)
     span = Span(header.epoch_ns, start, end)
     imu, of_imu = ImuSamples.empty(), _NOTHING
@@ -149,7 +135,7 @@ def write_log(log: Log, path: Path, audio: AudioEntry | None = None) -> None:
     samples. Raises InputError where something that is no log is at ``path``, or nothing can be
     written there.
     """
-    with whole_directory(path, replaces=is_log) as unfinished:
+    with whole_directory(path, replaces=has_header) as unfinished:
         if path.is_dir():
             _keep_others(path, unfinished)
         header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}

@@ -10,7 +10,7 @@ import pyarrow.parquet
 from magfusion.files.drive_columns import column_names, drive_columns, rotor_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
-from magfusion.files.log import HEADER, LogHeader, is_log
+from magfusion.files.log_header import is_log, read_header
 from magfusion.files.lost_rows import MOST_MISSING
 from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
@@ -18,7 +18,6 @@ from magfusion.files.plausible import beyond_range, check_field, check_imu
 from magfusion.files.readings_table import read_temperatures
 from magfusion.files.table import Span, find_table
 from magfusion.files.table_stream import SampleBlock, pieces
-from magfusion.files.yaml_files import read_yaml
 from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.temperature import Temperatures
@@ -121,7 +120,7 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     """
     if not is_log(path) or max(_rows(path, name) for name in _COLUMNS) <= LONG:
         return None
-    header = read_yaml(path / HEADER, LogHeader)
+    header = read_header(path)
     if header.audio is not None:
         return None
     tables = {name: find_table(path, name) for name in (*_COLUMNS, "fields")}

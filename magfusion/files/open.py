@@ -4,7 +4,8 @@ from pathlib import Path
 
 from magfusion.errors import InputError
 from magfusion.files.bag_topics import Topics, is_bag
-from magfusion.files.log import HEADER, is_log, read_log
+from magfusion.files.log import read_log
+from magfusion.files.log_header import HEADER, is_log
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -53,7 +54,7 @@ def open_log(
         aiding = () if site is None else site.aiding
         return read_bag(path, start, end, topics, report, aiding)
     raise InputError(
-        f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
-        " .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"
-        " tables of other names into a log by magfusion import."
+        f"{path}: is no log: found neither {HEADER} nor the tables of a log, mav0/imu0/data.csv"
+        " (EuRoC), or .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or convert"
+        " other tables by magfusion import."
     )

@@ -12,7 +12,7 @@ import pyarrow.parquet
 from magfusion.errors import InputError
 from magfusion.files.bag_topics import Topics
 from magfusion.files.inertial_tables import FIELD_LAYOUT, HALF_LAYOUTS, IMU_LAYOUT
-from magfusion.files.log import HEADER, LogHeader, is_log
+from magfusion.files.log_header import is_log, read_header
 from magfusion.files.open import open_log
 from magfusion.files.parquet_bounds import BATCH, refuse_unfolding
 from magfusion.files.table import (
@@ -24,7 +24,6 @@ from magfusion.files.table import (
     find_table,
     refuse_jump,
 )
-from magfusion.files.yaml_files import read_yaml
 from magfusion.units import Array, IntArray
 
 # Name of each stream, its file and its columns.
@@ -57,7 +56,7 @@ def pieces(
     if not is_log(path):
         yield from _whole(path, stream, start, end, topics)
         return
-    header = read_yaml(path / HEADER, LogHeader)
+    header = read_header(path)
     table = find_table(path, stream)
     if table is not None:
         for part in table_pieces(table, STREAMS[stream], Span(header.epoch_ns, start, end)):

@@ -18,7 +18,7 @@ from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
 from magfusion.files.foreign.phasor_rows import is_signed, write_phasors
 from magfusion.files.foreign.plan import Findings, ImportPlan
-from magfusion.files.log import HEADER
+from magfusion.files.log_header import HEADER
 from magfusion.files.site import load_site
 from magfusion.files.table import TIME, write_table
 from magfusion.files.yaml_files import write_yaml

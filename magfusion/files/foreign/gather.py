@@ -20,7 +20,7 @@ from magfusion.files.foreign.plan import Findings, ImportPlan, plan_stream
 from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
-from magfusion.files.log import is_log
+from magfusion.files.log_header import has_header
 from magfusion.model.site import Site
 
 TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
@@ -179,7 +179,7 @@ def _add(recording: Sequence[Path], wanted: ImportRequest, result: GatheredStrea
     path = recording[0]
     if not path.exists():
         raise InputError(f"{path}: there is no such file or directory; give the path of a source.")
-    if path.is_dir() and is_log(path):
+    if path.is_dir() and has_header(path):
         raise InputError(f"{path}: is a log of magfusion already; nothing is to import.")
     if _is_bag(path):
         return _add_bag(recording, wanted, result)
