@@ -86,7 +86,7 @@ def test_a_released_parameter_is_as_uncertain_as_it_was_wrong() -> None:
     step[block.columns] = [3.0, 0.0, -4.0]  # cm
     finding = Finding("lever_arm", "")
     moved = Correction(finding, corrected_site(SITE, lever, step), lever, step=step)
-    known, free = released(moved, ("phase",)), released(moved, None)
+    known, free = released(moved, SITE, ("phase",)), released(moved, SITE, None)
     assert known.site is moved.site
     assert not known.released
     assert free.released == (block,)
@@ -96,7 +96,22 @@ def test_a_released_parameter_is_as_uncertain_as_it_was_wrong() -> None:
         sensor.position_body, moved.site.platform.magnetometer.position_body
     )
     tilted = Correction(finding, corrected_site(SITE, tilt, step), tilt, step=step)
-    assert released(tilted, None) is tilted
+    assert released(tilted, SITE, None) is tilted
+
+
+def test_what_snapshots_estimate_is_estimated_from_the_whole_log() -> None:
+    """A beacon at another place; what they choose among usual mistakes is certain."""
+    first, *others = SITE.beacons
+    moved = replace(first, position_world=first.position_world + [0.3, 0.0, -0.4])
+    site = replace(SITE, beacons=(moved, *others))
+    estimate = Correction(Finding("beacon_pose", ""), site, is_estimate=True)
+    result = released(estimate, SITE, None)
+    assert [(block.kind, block.owner) for block in result.released] == [("position", first.name)]
+    sigma = result.site.beacons[0].sigma
+    np.testing.assert_allclose(sigma.position_world, 0.5, rtol=1e-9)  # m
+    np.testing.assert_array_equal(sigma.rotation_beacon, first.sigma.rotation_beacon)
+    chosen = estimate._replace(is_estimate=False)
+    assert released(chosen, SITE, None) is chosen
 
 
 def test_errors_of_an_imu_add_to_those_that_are_declared() -> None:

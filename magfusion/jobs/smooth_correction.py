@@ -49,7 +49,7 @@ def corrected(
         return None
 
     def tried(one: Correction) -> Trial[Finished] | None:
-        correction = released(one, settings.estimate)
+        correction = released(one, site, settings.estimate)
         used = log, correction.site, settings
         try:
             result = smooth(*used, report)

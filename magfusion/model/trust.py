@@ -13,8 +13,10 @@ import numpy as np
 from magfusion.model.short_repr import one_line
 from magfusion.units import Array, IntArray
 
-# Meaning of findings by code: the documentation of ``reasons`` in report.json.
 LISTED = 3  # items of a kind in a sentence; more are counted, or left out
+CORRECTED = "The result is corrected for it."  # the end of a finding
+
+# Meaning of findings by code: the documentation of ``reasons`` in report.json.
 CODES = {
     "accel_scale": "the mean specific force is not gravity's, by a scale or a bias",
     "accel_units": "the specific force is in another unit",
@@ -44,7 +46,7 @@ CODES = {
     "demodulated_apart": "several magnetometers were demodulated separately",
     "diverged": "the estimator neither converged nor explains the measurements",
     "drive_current": "the recorded current of a coil is noisy or not as declared",
-    "earth_field": "the steady field is not the Earth's as declared",
+    "earth_field": "the static field is not the Earth's as declared",
     "epoch_shift": "the stamps are shifted against the epoch of the drive phases",
     "false_samples": "single samples of the magnetometer are outliers",
     "few_data": "the measurements are too few for a part of the request",
@@ -65,7 +67,7 @@ CODES = {
     "gravity_missing": "gravity has been removed from the specific force",
     "gravity_sign": "the vertical of the accelerometer has the wrong sign",
     "ground": "the conductivity of ground or water is not as declared",
-    "gyro_field": "the rotation of the steady field is inconsistent with the gyroscope",
+    "gyro_field": "the rotation of the static field is inconsistent with the gyroscope",
     "gyro_g_sensitivity": "the gyroscope reacts to specific force",
     "gyro_scale": "the scale of the gyroscope is wrong",
     "gyro_sign": "the sign of the gyroscope, or of one axis, is reversed",

@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from magfusion.model.trust import Verdict
+from magfusion.model.trust import CORRECTED, Verdict
 from magfusion.results.brief_plan import (
     accuracy,
     bounds,
@@ -32,6 +32,7 @@ _NEXT = {
     Verdict.DOUBTFUL: "remove the cause above and repeat; until then the sigmas cover it",
     Verdict.FAILED: "remove the cause above and repeat; for diagnosis open {output}/failed",
 }
+_AFTER_CORRECTION = "check the correction, then use it: --site {output}/site.yaml"
 _NEXT_OF = {
     ("check", Verdict.TRUSTWORTHY): "magfusion smooth LOG",
     ("check", Verdict.DOUBTFUL): "remove the cause above, then magfusion smooth LOG",
@@ -103,6 +104,8 @@ def next_step(figures: Figures, output: Path | None) -> str:
         return ""
     look = look_of(str(figures.get("verdict", Verdict.TRUSTWORTHY)))
     text = _NEXT_OF.get((str(figures.get("job")), look), _NEXT[look])
+    if any(CORRECTED in str(one["text"]) for one in findings(figures, "reasons")):
+        text = _AFTER_CORRECTION
     return text.format(output=output) if output is not None or "{output}" not in text else ""
 
 
@@ -155,7 +158,7 @@ def _unverified(figures: Figures) -> str:
         for one in matters
     ]
     others = len(rows) - len(matters)
-    return ", ".join([*words, f"{others} of less effect (--verbose)"] if others else words)
+    return ", ".join([*words, f"{others} of smaller effect (--verbose)"] if others else words)
 
 
 def _is_site(figures: Figures) -> bool:

@@ -15,7 +15,15 @@ from magfusion.estimation.integrity.suspects import (
     Suspect,
 )
 from magfusion.model.imu_intrinsics import ImuIntrinsics
-from magfusion.model.parameters import PHASE, Block, Calibration, Parameter, initial_calibration
+from magfusion.model.parameters import (
+    PHASE,
+    Block,
+    Calibration,
+    Parameter,
+    candidates,
+    initial_calibration,
+    placed,
+)
 from magfusion.model.parameters.inertial import (
     ACCEL_BIAS,
     ACCEL_SCALE,
@@ -127,22 +135,36 @@ def released_blocks(fault: Suspect) -> tuple[Block, ...]:
     return blocks if whole and single and declarable and not fault.code else ()
 
 
-def with_wide_priors(site: Site, blocks: tuple[Block, ...], step: Array) -> Site:
-    """Return a site in which parameters are as uncertain as they were wrong.
+def estimated_blocks(declared: Site, corrected: Site) -> tuple[Block, ...]:
+    """Return the blocks whose values differ between two sites, if they are of one owner.
+
+    The sigma of each is the size of the difference, at least as declared.
+    """
+    before, after = (initial_calibration(site, 0.0) for site in (declared, corrected))
+    blocks = []
+    for parameter, owner in candidates(declared):
+        size = np.linalg.norm(parameter.difference(before, after, owner))
+        if parameter.declared and size > 0.0:
+            sigma = np.maximum(parameter.sigma(declared, owner), size)
+            blocks.append(Block(parameter, owner, slice(0), sigma))
+    return placed(blocks) if len({block.owner for block in blocks}) == 1 else ()
+
+
+def wide_sigmas(site: Site, blocks: tuple[Block, ...], step: Array) -> list[Array]:
+    """Return the sigmas by which parameters are as uncertain as they were wrong.
 
     Parameters
     ----------
     step : ndarray, shape (h,)
         Of all fixed parameters, in typical errors.
     """
-    sigmas = [
+    return [
         np.maximum(
             block.parameter.sigma(site, block.owner),
             block.sigma * np.linalg.norm(step[block.columns]),
         )
         for block in blocks
     ]
-    return with_sigmas(initial_calibration(site, 0.0), blocks, sigmas)
 
 
 def with_sigmas(calibration: Calibration, blocks: tuple[Block, ...], sigmas: list[Array]) -> Site:

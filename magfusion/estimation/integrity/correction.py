@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.integrity.change_detection import CHANGED
 from magfusion.estimation.integrity.corrected_site import (
     corrected_site,
+    estimated_blocks,
     released_blocks,
+    wide_sigmas,
     with_sigmas,
-    with_wide_priors,
 )
 from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.fixed_parameter_test import (
@@ -30,14 +31,13 @@ from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import SENSOR_POSITION, Block, Calibration, initial_calibration
 from magfusion.model.parameters.inertial import Bias
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import CORRECTED, Finding, Verdict
 from magfusion.units import Array
 
 T = TypeVar("T")
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
 MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
-CORRECTED = " The result is corrected for it."
 REFINED = " The remedy is refined by the inertial data."
 
 
@@ -215,7 +215,7 @@ def corrected_finding(
     explained = dict.fromkeys(code for code in codes if code != known.code)
     return replace(
         known,
-        text=known.text + CORRECTED,
+        text=f"{known.text} {CORRECTED}",
         verdict=Verdict.DOUBTFUL,
         weight=CAUSE_FIRST,
         remedy=changed_keys(declared, correction.site),
@@ -223,14 +223,18 @@ def corrected_finding(
     )
 
 
-def released(correction: Correction, groups: tuple[str, ...] | None) -> Correction:
+def released(correction: Correction, declared: Site, groups: tuple[str, ...] | None) -> Correction:
     """Return a correction whose parameters are estimated, where their groups are (None: all)."""
-    if correction.fault is None or correction.step is None:
-        return correction
-    blocks = released_blocks(correction.fault)
+    if correction.fault is not None and correction.step is not None:
+        blocks = released_blocks(correction.fault)
+        sigmas = wide_sigmas(correction.site, blocks, correction.step)
+    else:
+        is_estimate = correction.fault is None and correction.is_estimate
+        blocks = estimated_blocks(declared, correction.site) if is_estimate else ()
+        sigmas = [block.sigma for block in blocks]
     if not blocks or (groups is not None and any(b.group not in groups for b in blocks)):
         return correction
-    site = with_wide_priors(correction.site, blocks, correction.step)
+    site = with_sigmas(initial_calibration(correction.site, 0.0), blocks, sigmas)
     return correction._replace(site=site, released=blocks)
 
 
@@ -261,7 +265,7 @@ def as_estimated(
         after = parameter.moved(after, owner, parameter.difference(tried, fitted, owner))
         change = parameter.difference(before, fitted, owner)
         words.append(amounts(declared, block, change, sigma))
-    finding = correction.finding
+    finding = correction.finding if correction.words else _refined(correction)
     if correction.words:
         text = finding.text.replace(correction.words, "; ".join(words))
         finding = replace(finding, text=text)
@@ -307,7 +311,8 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
 
     Snapshots determine a parameter by the fields alone, the score by the whole motion.
     """
-    if score is None or not (correction.fault or correction.is_estimate):
+    is_open = correction.is_estimate and not correction.released
+    if score is None or not (correction.fault or is_open):
         return None
     every = suspects(correction.site, score.fixed)
     if correction.fault is not None:

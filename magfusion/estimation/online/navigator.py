@@ -383,7 +383,7 @@ class Navigator:
 
         It returns no state that this one has returned.
         """
-        correction = released(correction, self.settings.estimate)
+        correction = released(correction, self.site, self.settings.estimate)
         result = Navigator(correction.site, self.settings)
         result.declared = self.declared
         result._loop.try_correction(correction, self._loop, self.declared, self._history.span)
