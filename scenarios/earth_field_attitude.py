@@ -96,7 +96,7 @@ def simulated(config: Config) -> tuple[Log, Site]:
 
 
 def alone(log: Log, site: Site) -> Log:
-    """Return a log with the steady fields of another and no beacon at all."""
+    """Return a log with the static fields of another and no beacon at all."""
     source, calibration = demodulated(log, site, None), initial_calibration(site, 0.0)
     fields = source.fields
     silent = replace(fields, phasor_sensor=np.full_like(fields.phasor_sensor, np.nan))

@@ -59,7 +59,7 @@ def _line(frequency_hz: float, amplitude: float) -> Change:
 
 
 def _magnet_transits(_: Case, time: Array, measured: Array) -> tuple[Array, Array]:
-    """Return the steady field of a lift or a car that comes and goes."""
+    """Return the static field of a lift or a car that comes and goes."""
     pulse = 1e-5 * np.exp(-0.5 * ((time - 20.0) / 3.0) ** 2)
     return time, measured + pulse[:, None] * np.array([0.6, -0.5, 0.6])
 

@@ -97,7 +97,7 @@ def test_the_directions_of_a_window_are_those_of_its_phasors() -> None:
     assert design.across.shape[1] < 2 * len(frequencies) + 2
     affected = np.ones((1, len(frequencies)), dtype=bool)
     basis = _of_channels(design.tones[None], np.array([centre]), site, affected)[0]
-    # A field that changes as a parabola, under the mains and a drift of the steady field.
+    # A field that changes as a parabola, under the mains and a drift of the static field.
     phasor = rng.normal(size=(3, len(frequencies))) + 1j * rng.normal(size=(3, len(frequencies)))
     grown = np.polynomial.polynomial.polyval(elapsed, phasor)
     carrier = np.exp(2j * np.pi * frequencies[:, None] * (centre + elapsed))

@@ -62,7 +62,7 @@ def test_a_rate_that_no_card_has_is_refused() -> None:
 
 
 def test_a_sound_card_records_no_steady_field(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a sound card records no steady field; declare coil"):
+    with pytest.raises(InputError, match="a sound card records no static field; declare coil"):
         run_simulation(SimulateSettings(full_scale=1.0, duration=1.0), tmp_path / "walk")
     assert not list(tmp_path.iterdir())
 

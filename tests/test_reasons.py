@@ -36,7 +36,7 @@ def test_of_two_values_that_of_the_more_important_finding_is_the_remedy() -> Non
 def test_more_sentences_than_a_reader_reads_are_counted() -> None:
     (row,) = reasons(*(Finding("gap", f"Gap {k}.") for k in range(MOST_TEXTS + 2)))
     assert row["text"].count("Gap") == MOST_TEXTS
-    assert row["text"].endswith("And 2 more of this kind.")
+    assert row["text"].endswith("2 more of this kind.")
 
 
 def test_what_they_explain_is_one_list() -> None:

@@ -101,7 +101,7 @@ def import_walk(recorded: Path, channels: str, output: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_recording_is_imported_and_smoothed(recorded: Path, tmp_path: Path) -> None:
-    """The issue asks for 0.3 mm of the FLAC; nothing is made of the steady field it lacks."""
+    """The issue asks for 0.3 mm of the FLAC; nothing is made of the static field it lacks."""
     log = import_walk(recorded, "x,y,z,sync", tmp_path / "log")
     assert not (log / "magnetometer.parquet").exists()
     assert yaml.safe_load((log / "log.yaml").read_text())["audio"]["rate_hz"] == RATE_HZ

@@ -1,4 +1,4 @@
-"""A magnetometer that answers to a tone by less than to a steady field, and late."""
+"""A magnetometer that answers to a tone by less than to a static field, and late."""
 
 import re
 from collections.abc import Callable

@@ -87,7 +87,7 @@ def test_neighbouring_silent_slots_help_a_short_cycle() -> None:
 def test_a_state_that_knows_the_mains_takes_them_off() -> None:
     assert max(_hum(1e-3, 50.0, "state")) < -200.0
     assert max(_hum(1e-3, 49.8, "state")) < -40.0
-    # Each cycle sees the same phase of the mains: nothing tells them from a steady field.
+    # Each cycle sees the same phase of the mains: nothing tells them from a static field.
     assert max(_hum(5e-3, 50.0, "state")) == pytest.approx(5.1, abs=0.1)
 
 

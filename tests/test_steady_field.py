@@ -1,4 +1,4 @@
-"""The steady field by the poses against the Earth's as declared: one test online and offline."""
+"""The static field by the poses against the Earth's as declared: one test online and offline."""
 
 from dataclasses import replace
 

@@ -73,7 +73,7 @@ def to_do(draft: SiteDraft) -> list[str]:
     if draft.position_m is None:
         result.append("magnetometer: in the IMU's origin: --lever gives its position")
     if draft.rpy_deg is None:
-        result.append("magnetometer: turned as the IMU: --mounting gives its attitude")
+        result.append("magnetometer: parallel to the IMU is assumed: --mounting gives its attitude")
     return result
 
 
@@ -82,13 +82,13 @@ def _assumed(beacon: BeaconDraft) -> list[str]:
     if beacon.unknown is not None:
         missing = _MISSING[beacon.unknown]
         out.append(
-            f"unknown: {beacon.unknown}, for want of {missing}, which only smooth and calibrate log"
-            " estimate, and only with two known beacons"
+            f"its {beacon.unknown} is unknown, as {missing} is not given: only smooth and calibrate"
+            " log estimate it, with two known beacons"
         )
     if beacon.moment_a_m2 is None:
-        out.append(f"a moment of {GUESSED_MOMENT:g} A m^2, a mere guess, for want of moment_a_m2")
+        out.append(f"moment_a_m2 is not given; {GUESSED_MOMENT:g} A m^2 is assumed")
     if beacon.axes is None:
-        out.append("two coils, along x and y, for want of axes")
+        out.append("axes are not given; two coils, along x and y, are assumed")
     return out
 
 

@@ -57,7 +57,7 @@ def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: AntennaS
             )
             if when == "after":
                 known = float(one.rms_sigma[k]) / size
-                result.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, known to"))
+                result.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, standard error"))
                 assert solved.elsewhere is not None
                 rotated, words = float(solved.elsewhere[k]) / size, f"{name} error in any attitude"
                 result.append(Figure(f"{name}_{unit}_any_attitude", rotated, unit, label=words))

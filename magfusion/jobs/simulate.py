@@ -317,7 +317,7 @@ def _write_log(log: Log, directory: Path, full_scale_v: float | None, sensor: Ma
         return
     if log.waveform is None or not sensor.ac_coupled:
         raise InputError(
-            "--full-scale: a sound card records no steady field; declare coil, or ac_coupled: true,"
+            "--full-scale: a sound card records no static field; declare coil, or ac_coupled: true,"
             " for the site's single magnetometer"
         )
     entry, samples = as_recording(log.waveform, RECORDING, full_scale_v, log.epoch_ns)

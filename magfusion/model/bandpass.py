@@ -47,7 +47,7 @@ class BandFilter:
     def of_site(site: Site, rate_hz: float) -> "BandFilter | None":
         """Return the filter with the fewest samples.
 
-        None if bands overlap, no samples are saved, or the receiver needs its steady field.
+        None if bands overlap, no samples are saved, or the receiver needs its static field.
         """
         if not site.beacons or not site.platform.magnetometer.ac_coupled:
             return None

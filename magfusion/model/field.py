@@ -325,20 +325,20 @@ def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Arra
 
 
 class EarthObservation(NamedTuple):
-    """Predicted steady field with its Jacobian blocks, named by the variable of each."""
+    """Predicted static field with its Jacobian blocks, named by the variable of each."""
 
     measured_sensor: Array  # (..., 3) (T), measured axes
     platform_rotation: Array  # (..., 3, 3), right perturbation of world_from_body (T/rad)
     matrix: Array  # (..., 3, 9), magnetometer matrix, row by row (T)
     sensor_rotation: Array  # (..., 3, 3), right perturbation of body_from_sensor (T/rad)
     offset: Array  # (..., 3, 3), of the magnetometer
-    earth_world: Array  # (..., 3, 3), steady field, world axes
+    earth_world: Array  # (..., 3, 3), static field, world axes
 
 
 def observe_earth(
     magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
 ) -> EarthObservation:
-    """Predict the steady field measured by a magnetometer, with the Jacobian in the same call.
+    """Predict the static field measured by a magnetometer, with the Jacobian in the same call.
 
     ::
 
@@ -363,6 +363,6 @@ def observe_earth(
 def predict_earth(
     magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
 ) -> Array:
-    """Return the steady field that `observe_earth` returns, shape (..., 3) (T)."""
+    """Return the static field that `observe_earth` returns, shape (..., 3) (T)."""
     in_sensor = earth_field_world @ world_from_body @ magnetometer.body_from_sensor
     return np.asarray(in_sensor @ magnetometer.matrix.T + magnetometer.offset)

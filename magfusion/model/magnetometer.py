@@ -40,7 +40,7 @@ class Magnetometer:
     coil_kappa: float = 0.0
     # temperature dependence of matrix and offset
     temperature_model: SensorTemperatureModel | None = None
-    # response to alternating fields; None if equal to that of steady fields
+    # response to alternating fields; None if equal to that of static fields
     response: FrequencyResponse | AxisResponses | None = None
     # prior of the responses of y and z relative to x; None if known
     response_sigma: ResponseSigma | None = None
@@ -55,7 +55,7 @@ class Magnetometer:
     clock_rate_sigma: float = 0.0  # prior standard deviation of ``clock_rate``
     # largest value of each axis in size (T); by default a hundred times a fluxgate's
     field_range: float = 0.1
-    # whether it measures alternating fields alone: no steady field, and nothing of it
+    # whether it measures alternating fields alone: no static field, and nothing of it
     ac_coupled: bool = False
 
     @property

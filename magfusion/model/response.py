@@ -1,4 +1,4 @@
-"""Frequency response of a magnetometer relative to its response to steady fields.
+"""Frequency response of a magnetometer relative to its response to static fields.
 
 Fluxgates, search coils and anti-aliasing filters attenuate a tone and shift its phase.  Between
 the given frequencies both are linear in the frequency's logarithm.  A recording of volts is read as

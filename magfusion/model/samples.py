@@ -50,7 +50,7 @@ class Waveform:
     # times at which coils were driven, if recorded; includes bursts outside the samples
     marks: Marks | None = None
     axes: str = "xyz"  # axes of the receiver; the other columns are invalid
-    ac_coupled: bool = False  # whether the samples hold no steady field
+    ac_coupled: bool = False  # whether the samples hold no static field
 
     def __len__(self) -> int:
         return len(self.time)
@@ -313,6 +313,6 @@ class Log:
 
     @property
     def vectors(self) -> Waveform | None:
-        """Raw samples of the whole field; None if axes or the steady field are missing."""
+        """Raw samples of the whole field; None if axes or the static field are missing."""
         wave = self.waveform
         return None if wave is None or wave.axes != "xyz" or wave.ac_coupled else wave

@@ -76,7 +76,7 @@ def _long(site: Site, requested: LockinSettings | None) -> LockinSettings | None
 class JointDesign(NamedTuple):
     """Information of a window's samples on all tones together."""
 
-    # (m, directions), orthonormal: the tones orthogonal to steady field, drift and mains
+    # (m, directions), orthonormal: the tones orthogonal to static field, drift and mains
     across: Array
     # (nodes, directions, 2 tones), cosines and sines of each tone in these directions, by node
     tones: Array

@@ -62,7 +62,7 @@ class WindowOperator:
     lacking: tuple[int, ...] = ()
     # (channels,), tone of each channel, where several beacons share a frequency
     tone_of_channel: IntArray | None = None
-    ac_coupled: bool = False  # whether the samples hold no steady field
+    ac_coupled: bool = False  # whether the samples hold no static field
 
     @property
     def frequencies_hz(self) -> Array:
@@ -75,10 +75,10 @@ class WindowOperator:
         return np.take(by_tone, self.tone_of_channel, axis=axis)
 
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
-        """Turn raw samples into phasors and the steady field, each with covariance.
+        """Turn raw samples into phasors and the static field, each with covariance.
 
         `measured_sensor` (samples, 3) (T). Where a prediction has been subtracted, the noise next
-        to the tones excludes the leakage of motion. For the steady field, subtract the known offset
+        to the tones excludes the leakage of motion. For the static field, subtract the known offset
         or a prediction first: the gyro rotates an offset along with the samples.
         """
         samples, steady, _ = self.demodulate_both(measured_sensor)

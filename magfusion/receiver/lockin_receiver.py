@@ -68,7 +68,7 @@ class LockinReceiver(Receiver):
         if not separable(1.0 / rate_hz, self.settings, frequencies):
             raise InputError(
                 f"magnetometer: {window * rate_hz:.3g} samples in a window of {window:.3g} s are"
-                " too few to separate tones, drift and steady field; choose a longer window"
+                " too few to separate tones, drift and static field; choose a longer window"
                 f" (--window), or sample faster than at {rate_hz:.4g} Hz"
             )
         grid = WindowGrid(

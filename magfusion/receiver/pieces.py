@@ -147,7 +147,7 @@ def _design(
     """
     ramp = elapsed[..., None] * (2.0 / length)
     angle = 2.0 * np.pi * elapsed[..., None] * frequencies_hz
-    # Moving steel makes the steady field curve.
+    # Moving steel makes the static field curve.
     columns = [np.ones_like(ramp), ramp, np.cos(angle), np.sin(angle), ramp**2, ramp**3]
     if hum is not None:
         orders = hum.orders[_clear(hum, frequencies_hz, length)]

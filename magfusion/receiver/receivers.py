@@ -26,7 +26,7 @@ def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = Non
 
 
 def windowed(receiver: Receiver) -> LockinReceiver:
-    """Return a receiver whose windows include a steady field, the Earth's.
+    """Return a receiver whose windows include a static field, the Earth's.
 
     Raises InputError where it is of time slots.
     """

@@ -254,7 +254,7 @@ def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _S
 def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) -> Array:
     """Return the covariance per sample of the noise near the carrier, (n, 3, 3), non-rotating axes.
 
-    It is the power three cycles a slot away, tapered against leakage of hum.  A steady field, a
+    It is the power three cycles a slot away, tapered against leakage of hum.  A static field, a
     linear drift and the carrier do not contribute, whatever the slot's length.
     """
     away = 3.0 / length

@@ -17,7 +17,7 @@ BINS = 32  # of a slot
 MIN_BINS = 6  # of them with samples; a slot has eight
 MIN_CYCLES = 4
 LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
-STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
+STEADY_CYCLES = 4  # of the carrier, over which the mean is the static field
 MAX_SILENT_LEVEL = 0.4  # of the weakest driven slot
 
 

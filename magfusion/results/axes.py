@@ -20,7 +20,7 @@ AXES = (("x", "m"), ("y", "m"), ("z", "m"), ("rot_x", "deg"), ("rot_y", "deg"), 
 ROWS = {
     "error": "error",
     "sigma": "sigma",
-    "frame_sigma": "of it frame (survey)",
+    "frame_sigma": "sigma of the common frame (survey)",
     "frame_removed_error": "error without the frame",
     "frame_removed_sigma": "sigma without the frame",
 }
@@ -89,7 +89,7 @@ def axis_figures(
 
 
 def _frame_label(frame: Frame) -> str:
-    return f"of it frame (survey ± {1e3 * frame.survey_m:.3g} mm)"
+    return f"common frame (survey ± {1e3 * frame.survey_m:.3g} mm)"
 
 
 def _rms(values: Array) -> Array:

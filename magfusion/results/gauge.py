@@ -76,8 +76,8 @@ def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge
         parts[BEACON_POSITION, b.name] = b.position_world
         parts[LOG_MOMENT, b.name] = np.full(len(b.coils), 3.0)
     direction = _joined(blocks, parts)
-    name = "all distances larger together and the moments with their cube"
-    remedy = "acceleration alone observes it; move farther and faster, or measure a distance"
+    name = "common scale of all distances, with its cube that of the moments"
+    remedy = "only accelerations observe it: move farther and faster, or measure a distance"
     return [] if direction is None else [Gauge(name, remedy, PERCENT, direction, False)]
 
 
@@ -97,7 +97,7 @@ def _shifts(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gaug
         direction = _joined(blocks, {(BEACON_POSITION, b.name): step for b in beacons})
         if direction is not None:
             name = f"all beacons shifted together along {axis}"
-            remedy = "gauge: no log can determine it; survey one beacon better"
+            remedy = "not observable from any log (gauge freedom): survey one beacon better"
             result.append(Gauge(name, remedy, CENTIMETRE, direction))
     return result
 
@@ -117,7 +117,7 @@ def _turns(
             continue
         if k == 2:
             name = "all beacons rotated together about the vertical"
-            remedy = "gauge: no log can determine it; survey the bearing between two beacons better"
+            remedy = "not observable from any log (gauge freedom): survey the bearing between two beacons better"
         else:
             name = f"all beacons tilted together about {_AXES[k]}"
             remedy = "gravity alone observes it; record rest in several attitudes"
@@ -131,15 +131,17 @@ def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[
     moments: Parts = {(LOG_MOMENT, b.name): np.ones(len(b.coils)) for b in calibration.site.beacons}
     direction = _joined(blocks, moments | {place: -matrix.ravel()})
     if direction is not None:
-        name = "all moments larger together and the magnetometer's gain smaller"
-        remedy = "gauge: no log can determine it; measure one beacon's moment, or the gain"
+        name = "common scale of the moments, with its inverse that of the magnetometer's gain"
+        remedy = (
+            "not observable from any log (gauge freedom): measure one beacon's moment, or the gain"
+        )
         yield Gauge(name, remedy, PERCENT, direction)
     for axis, step in zip(_AXES, np.eye(3), strict=True):
         rotated: Parts = {(SENSOR_ROTATION, SENSOR_ROTATION.owner): step}
         direction = _joined(blocks, rotated | {place: (matrix @ skew(step)).ravel()})
         if direction is not None:
             name = f"the mounting rotated about the sensor's {axis} and the matrix rotated back"
-            remedy = "gauge: no log can determine it; fix one of the two"
+            remedy = "not observable from any log (gauge freedom): fix one of the two"
             yield Gauge(name, remedy, DEGREES, direction)
 
 

@@ -138,8 +138,8 @@ def _of_turning(
     axes = " and ".join(_AXES[k] for k in hardly)
     angles = ", ".join(f"{covered.turned_deg[k]:.0f}" for k in hardly)
     return (
-        f"The platform hardly rotated about its {axes} ({angles} deg rms): not determined is"
-        f" {' and '.join(waiting)}; rotate it about all three axes."
+        f"Rotation about {axes} of the body was small ({angles} deg rms), so that"
+        f" {' and '.join(waiting)} cannot be determined; rotate it about all three axes."
     )
 
 

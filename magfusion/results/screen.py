@@ -117,12 +117,12 @@ def _show_verdict(figures: Figures, console: Console, *, brief: bool) -> None:
     for one in findings(figures, "reasons"):
         console.print(f"  {one['text']}", soft_wrap=True, markup=False)
     for text in remark_texts(figures, routine=not brief):
-        console.print(f"  noticed: {text}", soft_wrap=True, markup=False)
+        console.print(f"  remark: {text}", soft_wrap=True, markup=False)
     if brief:
         return
     names = [str(one["parameter"]) for one in findings(figures, "unverified")]
     if names:
-        sentence = f"fixed, not observable in this log: {', '.join(names)}"
+        sentence = f"not observable in this log, fixed: {', '.join(names)}"
         console.print(f"  {sentence}", soft_wrap=True, markup=False)
 
 

@@ -58,7 +58,7 @@ def _one_of_each(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
     for every in of_code.values():
         texts = list(dict.fromkeys(one.text for one in every))
         more = len(texts) - MOST_TEXTS
-        text = " ".join([*texts[:MOST_TEXTS], *([f"And {more} more of this kind."] * (more > 0))])
+        text = " ".join([*texts[:MOST_TEXTS], *([f"{more} more of this kind."] * (more > 0))])
         # That of the most important one, where two are of one key.
         remedy = {k: v for one in reversed(every) for k, v in (one.remedy or {}).items()}
         explained = tuple(dict.fromkeys(code for one in every for code in one.explained))

@@ -218,10 +218,10 @@ def undetected_findings(
         if far:
             masked.append(f"beacon {named} is below the noise from {_places(far)}")
     if masked:
-        more = f"; and {len(masked) - LISTED} more for a while" if len(masked) > LISTED else ""
+        more = f", and {len(masked) - LISTED} more beacons at times" if len(masked) > LISTED else ""
         yield Finding(
             "low_signal",
-            f"{'; '.join(masked[:LISTED])}{more}: far away there, or motion and other fields"
+            f"{'; '.join(masked[:LISTED])}{more}: it is far away, or motion and other fields"
             " dominate.",
             Verdict.TRUSTWORTHY,
         )

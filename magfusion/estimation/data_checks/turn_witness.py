@@ -1,4 +1,4 @@
-"""What the gyroscope and the steady field say against each other: axes, signs, units, clocks."""
+"""What the gyroscope and the static field say against each other: axes, signs, units, clocks."""
 
 from collections.abc import Iterator
 
@@ -31,7 +31,7 @@ SCALE_EXPLAINED = 0.9  # of the turn by it
 
 
 def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
-    """Yield how the gyroscope and the steady field contradict each other.
+    """Yield how the gyroscope and the static field contradict each other.
 
     Without a site nothing is known of the mounting, so that only sign, scale and clock are judged.
     """
@@ -90,7 +90,7 @@ def _contradicted(found: FieldRotation) -> Iterator[Finding]:
 def _words(found: FieldRotation) -> str:
     return (
         f"as declared, the gyroscope explains {_percent(found.explained(np.eye(3)))} of the turn of"
-        f" the steady field (rms {found.speed / DEGREE:.0f} deg/s)"
+        f" the static field (rms {found.speed / DEGREE:.0f} deg/s)"
     )
 
 
@@ -106,10 +106,10 @@ def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]
         axis = ", ".join(f"{v:+.2f}" for v in turn / angle)
         yield Finding(
             "mounting",
-            f"magnetometer and gyroscope are turned against each other by {angle / DEGREE:.0f} deg"
-            f" from what body_from_sensor declares, about ({axis}) in body axes: so"
-            f" the turn of the steady field is explained {better:.0f} times better. Correct"
-            " rpy_deg of platform.magnetometer.body_from_sensor.",
+            f"magnetometer: its mounting differs by {angle / DEGREE:.0f} deg from body_from_sensor,"
+            f" about ({axis}) in body axes: with that, the rotation of the static field differs"
+            f" {better:.0f} times less from the gyroscope's. Correct rpy_deg of"
+            " platform.magnetometer.body_from_sensor.",
             Verdict.DOUBTFUL,
             angle / LEAST_ANGLE,
         )
@@ -117,12 +117,12 @@ def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]
 
 def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[Finding]:
     """Name a gyroscope that turns while the field stands still: a bias, or another unit."""
-    mean, said = np.mean(log.imu.gyro_body, axis=0), found.expected_rate
+    mean, expected = np.mean(log.imu.gyro_body, axis=0), found.expected_rate
     words = (
-        f"gyroscope: it says that the field turns by {said / DEGREE:.2g} deg/s (rms), and the field"
-        " stands still"
+        f"gyroscope: it measures {expected / DEGREE:.2g} deg/s (rms), and the static field does"
+        " not rotate"
     )
-    if not said > max(LEAST_TURN, NOT_AT_ALL * found.speed) or site is None:
+    if not expected > max(LEAST_TURN, NOT_AT_ALL * found.speed) or site is None:
         return
     imu = site.platform.imu
     rate_hz = 1.0 / float(np.median(np.diff(log.imu.time)))
@@ -137,7 +137,7 @@ def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[
             Verdict.FAILED,
             1e3,
         )
-    elif bias > max(DETECTION_SIGMAS * imu.gyro_bias_sigma, 0.5 * said):
+    elif bias > max(DETECTION_SIGMAS * imu.gyro_bias_sigma, 0.5 * expected):
         yield Finding(
             "imu_bias",
             f"{words}: a bias of ({', '.join(f'{v:+.3g}' for v in mean)}) rad/s,"
@@ -192,8 +192,8 @@ def _other_scale(scale: float, explained: float) -> Finding:
         cause, remedy, code = "its sign is reversed", "Multiply it by -1", "gyro_sign"
     return Finding(
         code,
-        f"gyroscope: {cause}: the steady field turns {scale:.3g} times as fast as it says, which"
-        f" explains {_percent(explained)} of that turn. {remedy}.",
+        f"gyroscope: {cause}: the static field rotates at {scale:.3g} of the measured rate, which"
+        f" explains {_percent(explained)} of its rotation. {remedy}.",
         Verdict.FAILED,
         1e3,
     )
@@ -207,16 +207,16 @@ def _other_axes(found: FieldRotation, matrix: Array, *, single: bool) -> Finding
         wrong = ", ".join(a for a, sign in zip("xyz", np.diagonal(matrix), strict=True) if sign < 0)
         return Finding(
             "gyro_sign",
-            f"gyroscope: the sign of {wrong} is reversed: {words}, and so {_percent(explained)}."
-            " Correct the driver.",
+            f"gyroscope: the sign of {wrong} is reversed: {words}, with it reversed"
+            f" {_percent(explained)}. Correct the driver.",
             Verdict.FAILED,
             1e3,
         )
     if np.linalg.det(matrix) < 0.0:
         return Finding(
             "imu_axes",
-            f"gyroscope: its axes are left-handed, x, y, z being {names} as recorded: {words}, and"
-            f" so {_percent(explained)}. Exchange them in the driver.",
+            f"gyroscope: its axes are left-handed: {words}, and with {names} as x, y, z"
+            f" {_percent(explained)}. Exchange them in the driver.",
             Verdict.FAILED,
             1e3,
         )
@@ -224,9 +224,9 @@ def _other_axes(found: FieldRotation, matrix: Array, *, single: bool) -> Finding
     return Finding(
         "mounting",
         f"magnetometer and gyroscope are turned against each other {how} from what"
-        f" body_from_sensor declares, or axes of one are permuted: {words}, and so turned"
-        f" {_percent(explained)}. Correct rpy_deg of platform.magnetometer.body_from_sensor, or"
-        " the driver's axes.",
+        f" body_from_sensor declares, or axes of one are permuted: {words}, with this"
+        f" mounting {_percent(explained)}. Correct rpy_deg of"
+        " platform.magnetometer.body_from_sensor, or the driver's axes.",
         Verdict.FAILED,
         1e3,
     )

@@ -47,7 +47,7 @@ class MotionCompensated:
 
     @staticmethod
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
-        """Return phasors of slots: too short for motion, and without a steady field."""
+        """Return phasors of slots: too short for motion, and without a static field."""
         none = np.full((len(fields), 3), np.nan)
         steady = SteadyFields(fields.time, none, np.full((*none.shape, 3), np.nan))
         return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady)

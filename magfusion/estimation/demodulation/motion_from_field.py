@@ -25,9 +25,9 @@ from magfusion.units import Array
 TURN_NOISE = 20.0  # rad/s^2/sqrt(Hz); of a hand that turns as fast as it can
 PUSH_NOISE = 10.0  # m/s^2/sqrt(Hz); likewise
 FASTEST_TURN = 5.0  # rad/s; one sigma of the initial rate
-STEADY_ERROR = 3e-4  # of the steady field: vibration, which no path follows
+STEADY_ERROR = 3e-4  # of the static field: vibration, which no path follows
 FIELD_ERROR = 1e-2  # of the beacons' fields: iron, and the calibration
-FIRST_STEADY = 1e-6  # T; error of the steady field in the first sample
+FIRST_STEADY = 1e-6  # T; error of the static field in the first sample
 GYRO_ERROR = 0.05  # rad/s; of a rate between two samples of a gyro: vibration
 WORST_MISFIT = 5.0  # mean squared innovation, in units of its expectation
 MIN_SAMPLES = 8  # samples

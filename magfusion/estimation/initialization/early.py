@@ -1,7 +1,7 @@
 """Early start, before a usual start has enough data.
 
 The motion of a single tracker of unknown hemisphere determines it within a second or two, and
-clearly rejects a mirrored start.  A receiver of alternating fields alone has no steady field that
+clearly rejects a mirrored start.  A receiver of alternating fields alone has no static field that
 needs checks over turns of the body; with several beacons each epoch determines its pose.  Less
 clear cases wait as long as all other starts do.
 """
@@ -66,7 +66,7 @@ def open_start(start: OnlineStart) -> NoStart:
 
 
 def _is_alternating(site: Site) -> bool:
-    """Return whether a receiver without a steady field has several beacons."""
+    """Return whether a receiver without a static field has several beacons."""
     return site.platform.magnetometer.ac_coupled and len(site.beacons) >= SEVERAL
 
 

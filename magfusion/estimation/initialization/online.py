@@ -317,7 +317,7 @@ def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:
 
 
 def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> SteadyFields | None:
-    """Return the steady fields of the epochs; None where an epoch has none."""
+    """Return the static fields of the epochs; None where an epoch has none."""
     known = {float(part.time[0]): part for part in parts}
     wanted = [known.get(float(s.time[0])) for s in fields]
     result = [part for part in wanted if part is not None]

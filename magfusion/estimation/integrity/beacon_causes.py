@@ -73,7 +73,7 @@ def _contradicts(known: Snapshots, left: Snapshots, name: str) -> bool:
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
     """Yield what iron on the body, or another scale of all fields, would explain.
 
-    `steady`: usual size of the steady field, relative to the Earth's.
+    `steady`: usual size of the static field, relative to the Earth's.
     """
     free = [(MATRIX, MATRIX.owner, 0.3)]
     if known.excess < MISFIT and not known.rejects(free, tests=1):
@@ -259,7 +259,7 @@ def _moved(
         "beacon_pose",
         f"beacon {name} is not where it was surveyed, but off by"
         f" ({_listed(100.0 * step, 2)}) cm and {angle:.2g} degrees",
-        "Survey it anew, or declare larger sigmas for it.",
+        "Survey it again, or declare larger sigmas for it.",
         at.site,
     )
 
@@ -293,7 +293,7 @@ def _fault(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explana
     if passes:
         cause += f" {_when(known.samples.time, false)}"
     else:
-        cause += ", in a way that no place and no strength of it explains"
+        cause += ": it fits no pose and no moment of the beacon"
     fault = _explained(
         known,
         left.chi_square * known.freedom / max(left.freedom, 1.0),

@@ -23,7 +23,7 @@ class Explanation:
     """One thing that people get wrong, tried on a log."""
 
     code: str  # of `magfusion.model.trust.CODES`
-    # cause, remedy: clauses: "the log is explained if ...", and what to do
+    # cause, remedy: a clause that says what is wrong, and what to do
     cause: str
     remedy: str
     # before, after: chi square as declared, and with this explanation
@@ -76,10 +76,10 @@ class Explanation:
 
     def text(self, of: str) -> str:
         """Return the sentences that say it, with the evidence."""
+        cause = self.cause[:1].upper() + self.cause[1:]
         return (
-            f"The log is explained if {self.cause}: the chi square of {of} falls from"
-            f" {self.before:.4g} to {self.after:.3g}, of {self.expected:.3g} expected at most."
-            f" {self.remedy}"
+            f"{cause}. With that, the chi square of {of} falls from {self.before:.4g} to"
+            f" {self.after:.3g} (limit {self.expected:.3g}). {self.remedy}"
         )
 
 

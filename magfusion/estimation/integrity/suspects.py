@@ -179,7 +179,7 @@ class Suspect(NamedTuple):
 def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
     """Return every parameter that is not estimated, with its typical error for a sigma.
 
-    `steady`: whether the steady field is measured.
+    `steady`: whether the static field is measured.
     """
     known = {block.key for block in estimated}
     every = (*PARAMETERS, *INERTIAL)

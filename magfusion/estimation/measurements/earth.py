@@ -47,7 +47,7 @@ SPEED_TIME = 2.0  # s; in which the speed counts once if no beacon is detected
 
 @dataclass(frozen=True, eq=False)
 class EarthField(Measurement):
-    """Steady field in the magnetometer, one group of three.
+    """Static field in the magnetometer, one group of three.
 
     Windows are symmetric, and a ramp is fitted with the constant: the time offset has an effect
     only by the rotation of the states.
@@ -97,7 +97,7 @@ def earth_measurement(
     applied_offset: Array,
     step: float,
 ) -> EarthField:
-    """Return steady fields as a measurement.
+    """Return static fields as a measurement.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def check_earth(site: Site) -> None:
         )
     if site.platform.magnetometer.ac_coupled:
         raise InputError(
-            "--earth uses the steady field, but the magnetometer is ac_coupled; omit it"
+            "--earth uses the static field, but the magnetometer is ac_coupled; omit it"
         )
     if field is None:
         raise InputError(
@@ -145,7 +145,7 @@ def check_earth(site: Site) -> None:
 
 
 def earth_cov(site: Site, steady: SteadyFields) -> Array:
-    """Return the covariance of each steady field, shape (n, 3, 3), measured axes (T^2)."""
+    """Return the covariance of each static field, shape (n, 3, 3), measured axes (T^2)."""
     assert site.earth_field_world is not None
     sensor = site.platform.magnetometer
     size = float(np.linalg.norm(site.earth_field_world))

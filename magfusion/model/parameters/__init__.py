@@ -88,7 +88,7 @@ GROUPS = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 
 def of_phasors(parameters: Iterable[Parameter]) -> tuple[Parameter, ...]:
-    """Return the parameters that affect more than the steady field."""
+    """Return the parameters that affect more than the static field."""
     return tuple(parameter for parameter in parameters if not parameter.steady_only)
 
 

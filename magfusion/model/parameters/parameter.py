@@ -139,7 +139,7 @@ class PhasorView(NamedTuple):
 
 
 class SteadyView(NamedTuple):
-    """Inputs of the Jacobian of the steady field."""
+    """Inputs of the Jacobian of the static field."""
 
     calibration: Calibration
     observation: EarthObservation
@@ -169,7 +169,7 @@ class Parameter:
     declared: ClassVar[bool] = False  # whether the site's file has its value and its sigma
     of_log: ClassVar[bool] = False  # whether it belongs to the log and is only recorded in the site
     each_log: ClassVar[bool] = False  # whether every log has its own value, declared or not
-    steady_only: ClassVar[bool] = False  # whether only the steady field determines it
+    steady_only: ClassVar[bool] = False  # whether only the static field determines it
     factor_of_phasor: ClassVar[bool] = False  # whether its Jacobian is proportional to the phasor
     inertial: ClassVar[bool] = False  # whether it corrects the inertial stream
     # Its mean variance, times this and this power of the inverse distance, is the relative

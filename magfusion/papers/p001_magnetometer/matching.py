@@ -26,8 +26,8 @@ LEAST_SHARE = 0.05  # of the field across an axis; below it an error of the fiel
 RESTING = 0.05  # of gravity; a specific force that differs by more is not that of a body at rest
 
 THREE_ANGLES = (
-    "one field vector determines two of three angles; give the yaw to estimate roll and pitch, or"
-    " add a second vector: gravity from the accelerometer, or the phasors of beacons"
+    "one field vector determines two of three angles: give the yaw, or use a second vector (gravity"
+    " from the accelerometer, or the phasors of beacons)"
 )
 
 
