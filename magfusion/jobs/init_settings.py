@@ -14,7 +14,8 @@ class InitSettings(TopicSettings):
         (),
         "A beacon, in the keys of a site; again for each",
         metavar="'NAME KEY=VALUE ...'",
-        note="frequency_hz, and position_m, rpy_deg, moment_a_m2, axes, radius_m, synchronised",
+        note="frequency_hz, and position_m, rpy_deg, moment_a_m2, axes, radius_m, synchronised"
+        " (false if not given)",
     )
     log: Path | None = option(
         None, "Recording in which to find the tones of the beacons", note="default: none"
