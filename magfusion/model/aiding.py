@@ -84,11 +84,18 @@ class AidingSamples:
     time : ndarray, shape (n,)
         Seconds since the log's epoch.
     value : ndarray, shape (n, components)
-        As `components` has them; NaN for an axis of a velocity that is not measured.  A relative
-        pose until ``time`` has the length of its interval (s), the translation in the sensor's axes
-        at its beginning (m) and the rotation vector from there to the axes at its end (rad).
+        ``velocity`` (n, 3) in sensor axes (m/s), NaN for an axis that is not measured; ``range``
+        (n, 1) (m); ``position`` (n, 3) in world axes (m); ``mark`` (n, 0); ``height`` (n, 1) (m);
+        ``pressure`` (n, 1) (Pa); ``heading`` (n, 1) (rad); ``relative_pose`` (n, 7), of an interval
+        that ends at ``time``: its length (s), the translation in the sensor's axes at its beginning
+        (m) and the rotation vector from there to the axes at its end (rad).
     marks : tuple of str
         Name of each sample's mark, if they are marks.
+
+    Raises
+    ------
+    InputError
+        Where shapes do not fit, or a sample has no finite value.
     """
 
     __repr__ = short_repr

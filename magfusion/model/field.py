@@ -141,6 +141,7 @@ def observe(
     magnetometer : Magnetometer
         Matrix, mounting and lever arm.
     world_from_body : ndarray, shape (..., 3, 3)
+        Attitude of the body.
     position_world : ndarray, shape (..., 3)
         Origin of the body (m).
     phase : ndarray, shape (..., tones), optional
@@ -151,7 +152,8 @@ def observe(
     Returns
     -------
     Observation
-        Leading axes as those of the poses.
+        ``phasor_sensor`` (..., tones, 3) (T, measured axes) and its derivatives; leading axes as
+        those of the poses.
     """
     if is_apart(magnetometer):
         separate = [

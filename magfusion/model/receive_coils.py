@@ -27,12 +27,13 @@ class Observation:
     phasor_sensor: ComplexArray  # (..., tones, 3) (T), measured axes
     # 6, right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m)
     platform_pose: ComplexArray
-    # 6, right perturbation of world_from_beacon: rotation, translation, beacon axes
+    # 6, right perturbation of world_from_beacon: rotation, translation, beacon axes (T/rad, T/m)
     beacon_pose: ComplexArray
     log_moments: ComplexArray  # logarithm of each coil's moment (T)
     phase: ComplexArray  # drive phase of the phasor's own tone; no further axis (T/rad)
     matrix: ComplexArray  # 9, magnetometer matrix, row by row (T)
     # 6, right perturbation of the sensor's pose in the body: rotation, translation, sensor axes
+    # (T/rad, T/m)
     body_from_sensor: ComplexArray
     # IMU time offset; no further axis (T/s). None where no twist was given
     time_offset: ComplexArray | None

@@ -120,9 +120,19 @@ class Site:
         (m/s^2)
     model_error : float
         Relative error of the field model, one sigma per phasor.
+    beacons : tuple of Beacon
+        In the order of the file, which is that of ``channels``.
+    platform : Platform
+        IMU, magnetometers, and models of the motion.
+    clock : ClockModel
+        Of the drives.
+    earth : EarthModel
+        Sigmas of the declared Earth field.
     model_error_length : float
         Correlation length of that error (m): it is caused by iron, is constant in place, and does
         not average over epochs that are closer.
+    location : Location, optional
+        Place and date, for the IGRF.
     earth_field_world : ndarray, shape (3,), optional
         (T); from ``location`` by the IGRF if that is given instead.
     calibration : mapping, optional

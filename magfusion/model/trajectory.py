@@ -64,7 +64,7 @@ class Trajectory(PoseAccess):
     accel_bias_body : ndarray, shape (n, 3), optional
         (m/s^2)
     pose_cov : ndarray, shape (n, 6, 6), optional
-        Rotation, then position; body axes, right perturbation (rad, m).
+        Rotation, then position; body axes, right perturbation (rad^2, rad m, m^2).
     """
 
     time: Array

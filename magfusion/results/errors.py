@@ -60,9 +60,11 @@ class TrajectoryErrors:
     # (n,), after the one constant world rotation that fits the attitudes best (rad)
     aligned_attitude: Array
     relative: RelativeErrors  # over consecutive pairs of compared epochs
-    world_from_body: Array  # (n, 3, 3), of the estimate
-    pose_cov: Array | None = None  # (n, 6, 6), of the estimate, where it has one
-    # (n,), normalised estimation error squared where there is a covariance, of `degrees_of_freedom`
+    world_from_body: Array  # (n, 3, 3), rotation matrices of the estimate
+    # (n, 6, 6), of the estimate, where it has one: rotation, translation, body axes (rad^2, m^2)
+    pose_cov: Array | None = None
+    # (n,), normalised estimation error squared where there is a covariance (no unit), of
+    # `degrees_of_freedom`
     nees: Array | None = None
     not_covered: str = ""  # why other epochs were not compared; empty where all were
     at_truth: bool = False  # whether the samples of the truth were compared

@@ -81,7 +81,9 @@ def smooth(
     log : Log
         With a waveform, or with phasors in the site's channel order.
     site : Site
+        Its sigmas are the priors of the calibration.
     settings : SmootherSettings, optional
+        The defaults if not given.
     report : callable, optional
         Called with stage, finished steps and number of steps.
     factors : gtsam.NonlinearFactorGraph, optional
@@ -90,6 +92,12 @@ def smooth(
         Initial values of their own keys.
     times : sequence of float, optional
         At which states are made for the factors (s), ascending, within the log.
+
+    Returns
+    -------
+    SmoothedLog
+        ``trajectory`` with n poses and their covariance, ``calibration`` with ``calibration_cov``.
+        Not yet judged: see `judge_result`.
 
     Raises
     ------

@@ -24,9 +24,9 @@ from magfusion.results.plots.drawn import draw_charts
 class ResultTrajectory(Trajectory):
     """A trajectory on the clock of a log, among the beacons of a site.
 
-    Besides the parts of `Trajectory`: ``time`` (n,) (s), ``position`` (n, 3) (m), ``rotation``
-    (SciPy's `Rotation`, world from body), ``euler`` (n, 3) (roll, pitch, yaw; rad) and ``cov``
-    (n, 6, 6) (rotation, then position; body axes; rad, m).
+    Besides the parts of `Trajectory`: ``time`` (n,) (s), ``position`` (n, 3) (m, world axes),
+    ``rotation`` (SciPy's `Rotation`, world from body), ``euler`` (n, 3) (roll, pitch, yaw; rad) and
+    ``cov`` (n, 6, 6) (rotation, then position; body axes; rad^2, rad m, m^2).
 
     Parameters
     ----------
@@ -115,12 +115,19 @@ def collect_states(states: Sequence[State], epoch_ns: int = 0) -> ResultTrajecto
     states : sequence of State
         In the order of their times, at least one; those of a lost navigator are guesses.
     epoch_ns : int
-        Zero of the clock of their times, as the log's.
+        Zero of the clock of their times, as the log's (ns).
+
+    Returns
+    -------
+    ResultTrajectory
+        With velocities, biases and ``pose_cov`` of all n states, and the site of the last one.
 
     Raises
     ------
     InputError
         Where there is no state.
+    ValueError
+        Where the times do not increase.
     """
     if not states:
         raise InputError("there is no state to collect: the navigator gave none yet")

@@ -43,15 +43,29 @@ TURN_STEP = 0.6  # rad rms between two knots of a turn, at most: more than pi is
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLog:
-    """A log and its true values."""
+    """A log and its true values.
+
+    Parameters
+    ----------
+    log : Log
+        Its ``truth`` is stamped on the log's clock at the IMU's rate.
+    true_site : Site
+        True calibration, noise and time offset of the IMU.
+    drives : Drives
+        True phases (rad) and relative drifts.
+    motion : SimulatedMotion
+        Exact truth at any time.
+    ambient : Ambient, optional
+        With the drawn iron.
+    """
 
     __repr__ = short_repr
 
-    log: Log  # its truth is stamped on the log's clock at the IMU's rate
-    true_site: Site  # true calibration, noise and time offset of the IMU
-    drives: Drives  # true phases and drifts
-    motion: SimulatedMotion  # exact truth at any time
-    ambient: Ambient | None = None  # with the drawn iron
+    log: Log
+    true_site: Site
+    drives: Drives
+    motion: SimulatedMotion
+    ambient: Ambient | None = None
 
     @property
     def time_offset(self) -> float:
@@ -63,7 +77,16 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     """Return a simulated log of a body moving among the beacons of a site.
 
     Calibration, motion, IMU, magnetometer, iron and random field have separate generators, spawned
-    from it: a change to one does not affect the draws of the others.
+    from ``rng``: a change to one does not affect the draws of the others.
+
+    Parameters
+    ----------
+    site : Site
+        As declared; the true one is drawn by its sigmas, unless ``config.perturb`` is False.
+    config : SimulationConfig
+        Motion, duration (s), rates (Hz) and disturbances.
+    rng : numpy.random.Generator
+        Equal seeds give equal logs.
 
     Raises
     ------

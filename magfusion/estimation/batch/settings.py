@@ -25,14 +25,14 @@ class EstimatorSettings:
     Parameters
     ----------
     estimate : tuple of str, optional
-        Calibration groups; by default those whose sigma in the site is not negligible.
+        Calibration groups; by default those whose sigma in the site is not negligible, () for none.
     lockin : LockinSettings, optional
-        By default chosen by the tones' spacing.
+        Window and step of the lock-in (s); by default chosen by the tones' spacing.
     earth : bool
-        Measure the Earth field too; where no beacon is detected, it and gravity alone constrain
-        the attitude.
+        Measure the Earth field too (default: no); where no beacon is detected, it and gravity alone
+        constrain the attitude.
     parameters : tuple of Parameter
-        Available kinds of calibration parameters.
+        Available kinds of calibration parameters; all of the package by default.
     """
 
     estimate: tuple[str, ...] | None = None
@@ -54,22 +54,22 @@ class SmootherSettings(EstimatorSettings):
     Parameters
     ----------
     coupling : {'tight', 'loose'}
-        Whether the phasors or their fixes enter the graph.
+        Whether the phasors (default) or their fixes enter the graph.
     loss : {None, 'huber', 'cauchy'}
         Robust loss of the field measurements, against false beacons, which sums of squares do not
-        model; it costs nothing where all are true.
+        model; Cauchy's by default.
     max_iterations : int
-        Maximum number of waveform predictions.
+        Maximum number of waveform predictions; 10 by default.
     tune : bool
         Whether noise and model error are estimated from the residuals, with their declared values
-        as a prior; with tight coupling.
+        as a prior; with tight coupling. By default they are.
     measurements : tuple of (ndarray, Measurement)
-        Further measurements, with the times of their rows (s), at which states are made.
+        Further measurements, with the times (n,) of their rows (s), at which states are made.
     factors : UserFactors, optional
         A user's, with the times at which states are made.
     engine : {'bordered', 'gtsam'}
-        Optimiser of each pass: our loop, or GTSAM's Levenberg-Marquardt, which is slower, to check
-        it.
+        Optimiser of each pass: our loop (default), or GTSAM's Levenberg-Marquardt, which is slower,
+        to check it.
     """
 
     __repr__ = short_repr

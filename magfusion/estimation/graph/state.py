@@ -24,18 +24,36 @@ ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
 @dataclass(frozen=True, eq=False)
 class State(PoseAccess):
-    """Motion and calibration at one time."""
+    """Motion and calibration at one time.
+
+    Parameters
+    ----------
+    time : float
+        On the log's clock (s).
+    world_from_body : ndarray, shape (3, 3)
+    position_world : ndarray, shape (3,)
+        Of the body's origin, the IMU (m).
+    velocity_world : ndarray, shape (3,)
+        (m/s)
+    accel_bias_body, gyro_bias_body : ndarray, shape (3,)
+        (m/s^2) and (rad/s); with a motion prior, the rate in place of the gyro's bias.
+    calibration : Calibration
+        With its newest estimate.
+    cov : ndarray, shape (15 + c, 15 + c)
+        Of rotation, position (body axes, right perturbation; rad, m), velocity (world), bias of
+        accelerometer and gyro, then of the c numbers of the calibration; squares of these units.
+    """
 
     __repr__ = short_repr
 
-    time: float  # on the log's clock (s)
-    world_from_body: Array  # (3, 3)
-    position_world: Array  # (3,) (m)
-    velocity_world: Array  # (3,) (m/s)
-    accel_bias_body: Array  # (3,) (m/s^2)
-    gyro_bias_body: Array  # (3,) (rad/s)
+    time: float
+    world_from_body: Array
+    position_world: Array
+    velocity_world: Array
+    accel_bias_body: Array
+    gyro_bias_body: Array
     calibration: Calibration
-    cov: Array  # (15 + calibration, 15 + calibration)
+    cov: Array
 
     @cached_property
     def pose(self) -> gtsam.Pose3:

@@ -62,8 +62,17 @@ def judge_result(result: R, log: Log) -> tuple[R, Trust]:
 
     Parameters
     ----------
+    result : Smoothed
+        As of `smooth`; not changed.
     log : Log
         Of the result; its raw streams are tested too.
+
+    Returns
+    -------
+    result : Smoothed
+        Of the same type, with ``trust``, and ``states.pose_cov`` enlarged where a test requires it.
+    trust : Trust
+        Verdict, reasons, remarks and unverified parameters.
 
     Raises
     ------

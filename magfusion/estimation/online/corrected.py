@@ -1,4 +1,4 @@
-"""What is found is used: a navigator of the site in which a mistake is undone.
+"""Correct the site of a navigator: a navigator of the site in which a mistake is undone.
 
 A correction is accepted only if no test contradicts the corrected states, as offline.
 """
@@ -13,9 +13,20 @@ from magfusion.model.trust import Verdict
 
 
 def corrected(navigator: Navigator) -> Navigator:
-    """Return a navigator with the mistake undone that was found last; the same one without any.
+    """Return a navigator with the latest mistake of the site undone; the same one without any.
 
-    The newest input is processed again, which takes about as long as a start.
+    The newest input (12 s) is processed again, which takes about as long as a start.  Call it after
+    each piece of data, and use what it returns in place of the argument.
+
+    Parameters
+    ----------
+    navigator : Navigator
+        Unchanged, but for the corrections that it offers, which are taken.
+
+    Returns
+    -------
+    Navigator
+        With the mistake in `Navigator.corrected`, if no test contradicts its states.
     """
 
     def tried(correction: Correction) -> Trial[Navigator] | None:

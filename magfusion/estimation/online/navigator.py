@@ -79,7 +79,7 @@ class Navigator:
     # Input
 
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Add inertial samples: times (k,), rates and specific forces (k, 3).
+        """Add samples: times (k,) (s), rates (rad/s), specific forces (m/s^2), body axes (k, 3).
 
         Raises
         ------
@@ -106,7 +106,7 @@ class Navigator:
     def add_magnetometer(
         self, time: Array, measured_sensor: Array, magnetometer: str | None = None
     ) -> None:
-        """Add raw samples of a magnetometer: times (k,), fields (k, 3) (T).
+        """Add raw samples of a magnetometer: times (k,) (s), fields (k, 3) (T, sensor axes).
 
         Columns of axes that the site does not declare are ignored.
 
@@ -126,7 +126,7 @@ class Navigator:
         self._advance_with_motion_prior()
 
     def add_drive(self, samples: DriveSamples) -> None:
-        """Add currents of coils, before the magnetometer samples of the same time.
+        """Add currents of coils (A), before the magnetometer samples of the same time (s).
 
         Raises
         ------
@@ -161,11 +161,11 @@ class Navigator:
         self._history.add(time, "add_slots", time, slot)
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
-        """Set the temperature of a beacon, or of the ``magnetometer``, for later samples."""
+        """Set the temperature (deg C) at a time (s) of a beacon or the ``magnetometer``."""
         self._readings.temperatures.add_reading(part, time, degc)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
-        """Add demodulated phasors, channels in the site's order, with their static fields.
+        """Add phasors (T), channels in the site's order, with static fields (T) if measured.
 
         Raises
         ------
@@ -301,12 +301,12 @@ class Navigator:
         return built
 
     def state(self, time: float | None = None) -> JudgedState:
-        """Return the state at a time, propagated by the inertial stream from the last epoch.
+        """Return the newest state, or its propagation by the IMU to a later time.
 
         Parameters
         ----------
         time : float, optional
-            (s); the newest inertial sample where it is not given.
+            (s), on the log's clock; the newest inertial sample where it is not given.
 
         Raises
         ------
@@ -322,7 +322,7 @@ class Navigator:
 
     @property
     def distortion(self) -> dict[str, float]:
-        """By beacon, running mean of the squared innovation over its expectation."""
+        """By beacon, running mean of the squared innovation over its expectation; 1 expected."""
         return self._loop.running.update.gate.distortion
 
     def take_lagged(self) -> list[JudgedState]:
@@ -352,12 +352,12 @@ class Navigator:
 
     @property
     def corrected(self) -> tuple[Finding, ...]:
-        """Mistakes of the declared site that are undone in this one."""
+        """Mistakes of ``declared`` that are undone in ``site``, each with its remedy."""
         return self._loop.corrections.findings
 
     @property
     def remainder(self) -> Correction | None:
-        """Of a corrected parameter, by what it still seems to be wrong."""
+        """Further correction of a corrected parameter that the newest data suggest, if any."""
         return self._loop.remainder
 
     def take_corrections(self) -> tuple[Correction, ...]:
@@ -393,12 +393,12 @@ class Navigator:
 
     @property
     def counts(self) -> Counter[str]:
-        """Numbers of rejections, losses and recoveries, by reason."""
+        """Numbers of rejected channels, losses and recoveries so far, by reason."""
         return self._loop.counts
 
     @property
     def losses(self) -> dict[str, int]:
-        """All rejections, losses and recoveries by reason: `counts`, windows, samples."""
+        """`counts`, and numbers of windows, samples and factors that are not used, by reason."""
         return self._loop.losses
 
     def checkpoint(self) -> dict[str, Any]:

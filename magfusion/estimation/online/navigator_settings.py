@@ -17,25 +17,35 @@ class NavigatorSettings(EstimatorSettings):
     Parameters
     ----------
     estimator : {'smoother', 'ekf'}
+        Fixed-lag smoother (default), or iterated extended Kalman filter.
     lag : float
-        Window of the smoother (s).
+        Lag of the smoother (s); 4 by default. The filter ignores it.
     delay : float
-        Largest delay of samples that are still sorted in (s); states are delayed as much.
+        Largest delay of samples that are still sorted in (s); states are delayed as much. 0 by
+        default.
     start_duration : float
-        Data gathered before the first state (s); longer while they are ambiguous.
+        Data gathered before the first state (s); longer while they are ambiguous. 6 by default; a
+        third of it for a tracker whose side is undeclared, and for a receiver without static field.
     longest_step : float
-        Longest time between states without any field (s).
+        Longest time between states without any field (s); 5 by default.
     risk : Risk, optional
-        Integrity risk of the protection levels; without it there are none, and updates cost less.
+        Integrity risk of the protection levels; without it (default) there are none, and updates
+        cost less.
     rate : 'field', 'imu' or float
-        Where states are output besides those of the epochs: nowhere, at every inertial sample, or
-        at a rate (Hz); they are propagated from the newest epoch.
+        Where states are output besides those of the epochs: nowhere (default), at every inertial
+        sample, or at a rate (Hz); they are propagated from the newest epoch.
     horizon : float
-        How far ahead they are predicted (s).
+        How far ahead they are predicted (s); 0 by default.
     correction_time : float
-        Time in which a correction enters them (s); at once where it is zero.
+        Time in which a correction enters them (s); at once where it is zero (default).
     lost_beyond : float
-        Sigma of the position (m) beyond which a platform that detects no beacon is lost.
+        Sigma of the position (m) beyond which a platform that detects no beacon is lost; 1 by
+        default.
+
+    Notes
+    -----
+    The other fields are those of `EstimatorSettings`: ``estimate``, ``lockin``, ``earth`` and
+    ``parameters``.
     """
 
     __repr__ = short_repr

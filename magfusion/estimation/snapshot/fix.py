@@ -32,7 +32,7 @@ class Fixes:
     time: Array  # (n,) (s)
     world_from_body: Array  # (n, hypotheses, 3, 3)
     position_world: Array  # (n, hypotheses, 3) (m)
-    pose_cov: Array  # (n, hypotheses, 6, 6), rotation, then position; body axes (rad, m)
+    pose_cov: Array  # (n, hypotheses, 6, 6), rotation, then position; body axes (rad^2, m^2)
     # (n, hypotheses), squared residual in units of its sigma, plus that of the prior; infinite
     # where a row has fewer hypotheses
     cost: Array

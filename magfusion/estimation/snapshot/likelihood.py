@@ -57,7 +57,11 @@ def fix_epochs(
     Parameters
     ----------
     samples : FieldSamples
-        Channels in the site's order.
+        Of n epochs, channels in the site's order.
+    calibration : Calibration
+        As of `magfusion.model.parameters.initial_calibration`.
+    gravity : Gravity, optional
+        Direction of gravity at the epochs, which excludes poses.
     prior : Trajectory, optional
         With ``pose_cov``, at the same times: one more candidate, and a term of the posterior.
     survey_error : bool
@@ -67,6 +71,12 @@ def fix_epochs(
         beacons; ``gain``, one of each beacon.
     gain_sigma : float
         Prior of the logarithm of a gain.
+
+    Returns
+    -------
+    Fixes
+        Of n epochs, each with its hypotheses, the most probable first: ``position_world`` (m),
+        ``world_from_body``, ``pose_cov`` (body axes; rad^2, m^2).
 
     Raises
     ------
