@@ -102,7 +102,8 @@ def test_a_released_parameter_is_as_uncertain_as_it_was_wrong() -> None:
 def test_what_snapshots_estimate_is_estimated_from_the_whole_log() -> None:
     """A beacon at another place; what they choose among usual mistakes is certain."""
     first, *others = SITE.beacons
-    moved = replace(first, position_world=first.position_world + [0.3, 0.0, -0.4])
+    place = first.position_world + np.array([0.3, 0.0, -0.4])
+    moved = replace(first, position_world=place)
     site = replace(SITE, beacons=(moved, *others))
     estimate = Correction(Finding("beacon_pose", ""), site, is_estimate=True)
     result = released(estimate, SITE, None)

@@ -29,6 +29,8 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 
 GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
 
+SCALE = "common scale of all distances"
+
 
 def uncertain(site: Site) -> Site:
     sigma = BeaconSigma(np.full(3, 0.05), np.full(3, 0.03), np.full(2, 0.03))
@@ -84,7 +86,7 @@ def test_no_measurement_tells_a_gauge(problem: tuple[Calibration, tuple[Block, .
     result = gauges(calibration, blocks)
     assert len(result) >= 11  # shifts, turns, the scale of moments, the mounting, the scale of all
     for gauge in result:
-        if not (gauge.name.startswith("common scale of all distances") and len(calibration.site.channels) > 4):
+        if not (gauge.name.startswith(SCALE) and len(calibration.site.channels) > 4):
             assert unexplained(gauge, by_pose, by_calibration) < 1e-9, gauge.name
 
 
@@ -95,7 +97,7 @@ def test_the_platform_need_not_move_for_what_is_between_sensor_and_coils() -> No
     _, by_calibration = linear(calibration, blocks, poses(20))
     names = []
     for gauge in gauges(calibration, blocks):
-        if not gauge.name.startswith("all beacons") and not gauge.name.startswith("common scale of all distances"):
+        if not gauge.name.startswith("all beacons") and not gauge.name.startswith(SCALE):
             change = np.linalg.norm(by_calibration @ gauge.direction)
             assert change < 1e-9 * np.linalg.norm(by_calibration)
             names.append(gauge.name)
@@ -169,7 +171,7 @@ def test_the_gauge_is_named_with_what_it_leaves(
     assert [one.ratio for one in result.gauge] == pytest.approx([1.0] * len(words), abs=1e-6)
     # Tilt and scale are open where there is no IMU, and are told apart from the gauge.
     assert sum("tilted" in one.words for one in result.weakest) == 2
-    assert sum("common scale of all distances" in one.words for one in result.weakest) == 1
+    assert sum(SCALE in one.words for one in result.weakest) == 1
     assert result.determined == dimension(blocks) - len(words) - len(result.weakest)
 
 

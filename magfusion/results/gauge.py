@@ -117,7 +117,9 @@ def _turns(
             continue
         if k == 2:
             name = "all beacons rotated together about the vertical"
-            remedy = "not observable from any log (gauge freedom): survey the bearing between two beacons better"
+            remedy = (
+                "not observable from any log (gauge freedom): survey a bearing between two beacons"
+            )
         else:
             name = f"all beacons tilted together about {_AXES[k]}"
             remedy = "gravity alone observes it; record rest in several attitudes"
@@ -131,7 +133,7 @@ def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[
     moments: Parts = {(LOG_MOMENT, b.name): np.ones(len(b.coils)) for b in calibration.site.beacons}
     direction = _joined(blocks, moments | {place: -matrix.ravel()})
     if direction is not None:
-        name = "common scale of the moments, with its inverse that of the magnetometer's gain"
+        name = "common scale of the moments, with its inverse the magnetometer's gain"
         remedy = (
             "not observable from any log (gauge freedom): measure one beacon's moment, or the gain"
         )
@@ -175,6 +177,6 @@ def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
             continue
         against = " against its drive phase" if tones else ""
         name = f"beacon {beacon.name} rotated about its own axis{against}"
-        remedy = "gauge: its field does not change; nothing depends on it"
+        remedy = "its field does not change (gauge freedom): nothing depends on it"
         result.append(Gauge(name, remedy, DEGREES, direction / turn))
     return result
