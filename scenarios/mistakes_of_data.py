@@ -150,6 +150,7 @@ MISTAKES = (
     ),
     Mistake("accel_sign", "data", _imu(accel=lambda a: -a), _GRAVITY),
     Mistake("accel_in_g", "data", _imu(accel=lambda a: a / 9.81), ("accel_units",)),
+    Mistake("accel_y_in_g", "data", _imu(accel=lambda a: a / [1, 9.81, 1]), ("accel_units",)),
     Mistake("accel_in_mg", "data", _imu(accel=lambda a: a / 9.81e-3), ("accel_units",)),
     Mistake("accel_scale_3pct", "data", _imu(accel=lambda a: 1.03 * a), ("accel_scale", "gravity")),
     Mistake("gravity_removed", "data", of_imu(_without_gravity), ("gravity_missing",)),

@@ -57,6 +57,7 @@ NAMED = {
     "gyro_deg_s": "gyro_units",
     "accel_sign": "gravity_sign",
     "accel_in_g": "accel_units",
+    "accel_y_in_g": "accel_units",
     "gravity_removed": "gravity_missing",
     "imu_xy_swapped": "imu_axes",
     "imu_1s_late": "time_offset",
@@ -213,6 +214,9 @@ def test_of_two_causes_that_explain_alike_none_is_named() -> None:
     assert clearly_best([one, Explanation("moments", "", "", 5000.0, 400.0, 400.0)]) is one
     assert clearly_best([Explanation("phase", "", "", 500.0, 400.0, 400.0)]) is None
     assert clearly_best([]) is None
+    assert clearly_best([Explanation("phase", "", "", np.nan, np.nan, 400.0)]) is None
+    # Much less than before, and yet far from explained.
+    assert clearly_best([Explanation("moment_units", "", "", 3.5e4, 1010.0, 144.0)]) is None
 
 
 def test_what_says_why_comes_before_what_only_says_where() -> None:

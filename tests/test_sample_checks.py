@@ -27,11 +27,12 @@ from spoiled_log import (
 )
 
 from magfusion.estimation.data_checks.data_quality import recorded
+from magfusion.estimation.data_checks.gravity_and_field_checks import wrong_force
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial, white_density
 from magfusion.estimation.data_checks.samples import clipped
 from magfusion.estimation.data_checks.spectrum import aliased, mains_of
 from magfusion.estimation.data_checks.stamps import timing
-from magfusion.estimation.data_checks.still_means import still_means
+from magfusion.estimation.data_checks.still_means import StillMeans, still_means
 from magfusion.estimation.integrity.quick_check import quick_check
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
@@ -249,3 +250,14 @@ def test_mains_are_named_and_no_doubt() -> None:
     trust = quick_check(one.log, one.site).trust
     assert trust.verdict is Verdict.TRUSTWORTHY
     assert "mains of 50 Hz" in trust.remarks[0].text
+
+
+def test_one_axis_in_g_is_named_where_the_body_stays_level() -> None:
+    force_body = np.tile([0.3, -0.2, 1.0], (5, 1)) + 0.02 * np.arange(5)[:, None]
+    still = np.broadcast_to(np.eye(3), (5, 3, 3))
+    means = StillMeans(
+        np.arange(5.0), force_body, np.full((5, 3), np.nan), still, lambda time: np.eye(4)[[3]]
+    )
+    (finding,) = wrong_force(means, None)
+    assert finding.code == "accel_units"
+    assert "its z is in g." in finding.text

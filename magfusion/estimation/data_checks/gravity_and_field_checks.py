@@ -103,6 +103,18 @@ def _turned_by_gyroscope(log: Log, means: StillMeans, site: Site | None) -> Iter
     )
 
 
+def _other_unit(force_body: Array, gravity: float) -> str:
+    """Return in which unit all axes are, or one, and the remedy; empty if in none."""
+    every = {"it": np.ones(3)} | dict(zip(("its x", "its y", "its z"), np.eye(3), strict=True))
+    for unit, factor in UNITS_OF_FORCE:
+        for which, chosen in every.items():
+            converted = np.linalg.norm(force_body * np.where(chosen, 1.0 / factor, 1.0), axis=1)
+            mean = float(np.median(converted))
+            if abs(mean / gravity - 1.0) < UNIT and np.std(converted) < STEADY * mean:
+                return f"{which} is in {unit}. Multiply it by {1.0 / factor:.6g}"
+    return ""
+
+
 def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
     """Yield errors of the mean specific force: its unit, missing gravity, or its size."""
     gravity = STANDARD_GRAVITY if site is None else site.gravity
@@ -112,15 +124,10 @@ def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
         f"accelerometer: the mean specific force in gyro-stabilized axes is {size:.3g} m/s^2,"
         f" gravity is {gravity:.4g}"
     )
-    for unit, factor in UNITS_OF_FORCE:
-        if abs(size / (factor * gravity) - 1.0) < UNIT and scatter < STEADY * size:
-            yield Finding(
-                "accel_units",
-                f"{findings}: it is in {unit}. Multiply it by {1.0 / factor:.6g}.",
-                Verdict.FAILED,
-                2e3,
-            )
-            return
+    unit = _other_unit(means.force_body, gravity) if abs(size / gravity - 1.0) > UNIT else ""
+    if unit:
+        yield Finding("accel_units", f"{findings}: {unit}.", Verdict.FAILED, 2e3)
+        return
     if size < MISSING * gravity:
         yield Finding(
             "gravity_missing",

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from math import isfinite
 
 from scipy.special import expit
 
@@ -12,7 +13,8 @@ CLEARLY = 2.5  # times smaller than before must chi square be, and than with any
 SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
 PENALTY = 6.0  # of chi square, for each parameter that is found
 ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
-LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise
+LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise,
+MOST_LEFT = 4.0  # but not more than this times expected: errors twice as large as declared
 ALIKE = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
@@ -57,7 +59,8 @@ class Explanation:
     @property
     def clear(self) -> bool:
         """Whether it explains so much that it is worth saying."""
-        enough = self.after < max(ENOUGH * self.expected, LITTLE * self.before)
+        little = min(LITTLE * self.before, MOST_LEFT * self.expected)
+        enough = self.after < max(ENOUGH * self.expected, little)
         # A bias or a lever arm that its prior holds back costs little, however sure it is.
         noise = max(self.after / max(self.expected, 1.0), 1e-9)
         significant = self.found > 0 and self.fall / self.found > SIGNIFICANT * noise
@@ -90,7 +93,7 @@ def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
     explains as much, and says what it is, is the better explanation.  Of one code, the first of
     those that explain equally much is the most common.
     """
-    every = list(tried)
+    every = [one for one in tried if isfinite(one.score)]  # without one if it has no solution
     ranked = sorted(every, key=lambda one: one.score)
     if not ranked:
         return None

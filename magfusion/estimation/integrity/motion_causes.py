@@ -66,6 +66,9 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
     imu = "Check gyro_x/y/z and accel_x/y/z: right-handed axes, rad/s, m/s^2, +g on z at rest."
     for words, unit in ACCEL_UNITS.items():
         yield tried("accel_units", f"the specific forces are {words}", imu, EYE, unit * EYE)
+        for axis, one in zip("xyz", EYE, strict=True):
+            cause = f"the specific force on {axis} is {words}"
+            yield tried("accel_units", cause, imu, EYE, np.diag(np.where(one, unit, 1.0)))
     yield tried(
         "gravity_missing",
         "gravity was removed from the specific force",
