@@ -256,7 +256,7 @@ def test_one_axis_in_g_is_named_where_the_body_stays_level() -> None:
     force_body = np.tile([0.3, -0.2, 1.0], (5, 1)) + 0.02 * np.arange(5)[:, None]
     still = np.broadcast_to(np.eye(3), (5, 3, 3))
     means = StillMeans(
-        np.arange(5.0), force_body, np.full((5, 3), np.nan), still, lambda time: np.eye(4)[[3]]
+        np.arange(5.0), force_body, np.full((5, 3), np.nan), still, lambda _time: np.eye(4)[[3]]
     )
     (finding,) = wrong_force(means, None)
     assert finding.code == "accel_units"
