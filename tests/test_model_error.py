@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from example_site import mixed_site
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.measurements.model_error import (
@@ -11,7 +12,7 @@ from magfusion.estimation.measurements.model_error import (
     epochs_sharing_error_online,
 )
 from magfusion.estimation.measurements.phasors import field_phasors
-from magfusion.model.noise import model_error_cov
+from magfusion.model.noise import measurement_cov, model_error_cov
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
@@ -96,3 +97,24 @@ def test_declared_iron_is_honest_where_it_counts_once() -> None:
     white = [_in_iron(seed, 0.0) for seed in range(2)]
     assert np.mean(together) < 12.0, together
     assert np.mean(white) > 2.0 * np.mean(together), (white, together)
+
+
+def test_a_tone_below_the_noise_leaves_the_weight_of_the_beacon_s_others() -> None:
+    """Each coil of beacon B has a tone of its own: the others still show its distance."""
+    site = mixed_site()
+    start = site.channels.index(("B", 0))
+    phasor = np.full((1, len(site.channels), 3), 1e-6 + 5e-7j)
+    samples = FieldSamples(
+        time=np.zeros(1),
+        phasor_sensor=phasor,
+        phasor_cov=np.broadcast_to(1e-20 * np.eye(3), (1, len(site.channels), 3, 3)),
+        window=np.full(1, 0.4),
+        channels=site.channels,
+    )
+    whole = measurement_cov(site, samples, survey_error=True)
+    phasor = phasor.copy()
+    phasor[0, start] = np.nan
+    part = measurement_cov(site, replace(samples, phasor_sensor=phasor), survey_error=True)
+    others = [start + 1, start + 2]
+    before, after = (np.trace(cov[0, others], axis1=1, axis2=2) for cov in (whole, part))
+    assert np.all((after > 0.5 * before) & (after < 2.0 * before))

@@ -40,13 +40,21 @@ def calibration_error(site: Site, distance: Array, sensor: int = 0) -> Array:
 
 
 def _distances(site: Site, square: Array) -> Array:
-    """Estimate the range of each beacon from its field strength alone, within a sixth."""
+    """Estimate the range of each beacon from its field strength alone, within a sixth.
+
+    By the tones that were measured; NaN where a beacon has none.
+    """
     out, start = [], 0
     for beacon in site.beacons:
         rows = slice(start, start + len(beacon.tones))
-        drive = beacon.moments_beacon.T @ beacon.excitation
-        power = np.sum(square[:, rows], axis=(1, 2))
-        out.append(np.cbrt(MU0_OVER_4PI * np.sqrt(2.0 * np.sum(np.abs(drive) ** 2) / power)))
+        drive = np.sum(np.abs(beacon.moments_beacon.T @ beacon.excitation) ** 2, axis=0)
+        power = np.sum(square[:, rows], axis=2)
+        there = np.isfinite(power)
+        measured, driven = np.sum(np.where(there, power, 0.0), axis=1), there @ drive
+        ratio = np.divide(
+            2.0 * driven, measured, out=np.full(len(square), np.nan), where=driven > 0.0
+        )
+        out.append(np.cbrt(MU0_OVER_4PI * np.sqrt(ratio)))
         start = rows.stop
     return np.stack(out, axis=1)
 

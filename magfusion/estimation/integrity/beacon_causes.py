@@ -36,6 +36,8 @@ WORSE = 6.0  # times its sigmas, that a survey may be wrong
 SURVEYED = 0.3  # of chi square's freedom, that a survey leaves: snapshots weigh by its sigmas too
 MISFIT = 1.2  # chi square of snapshots over its freedom, above which fields are not explained
 SILENT = 0.2  # of the field that is expected
+LOUD = 5.0  # times its noise: a field that is measured, whatever is expected,
+LEAKING = 0.01  # unless it is less than this of another's, of which a part leaks into its tone
 STEADY = 0.05  # spread of a gain over time that is none
 WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment, phase (rad)
 
@@ -243,9 +245,8 @@ def _moved(
     name = beacon.name
     free = [(BEACON_POSITION, name, WIDE[0]), (BEACON_ROTATION, name, WIDE[1])]
     best, at = np.inf, known.calibration
-    for turn in _turns():
-        start = trial(replace(beacon, world_from_beacon=beacon.world_from_beacon @ turn))
-        after, found = start.fitted(free, fixes)
+    for place in _placed(beacon):
+        after, found = trial(place).fitted(free, fixes)
         if after < best:
             best, at = after, found
         if best < 2.0 * known.freedom:
@@ -267,7 +268,7 @@ def _moved(
 def _silent(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explanation | None:
     """Return that a beacon is silent, where it is."""
     heard = np.isfinite(gain)
-    silent = heard & (np.abs(gain) < SILENT)
+    silent = heard & (np.abs(gain) < SILENT) & ~_is_loud(known, name)
     if np.sum(silent) < max(2, 0.05 * np.sum(heard)):
         return None
     whole = np.sum(silent) > 0.9 * np.sum(heard)
@@ -320,6 +321,17 @@ def _gains(known: Snapshots, fixes: Fixes, name: str) -> Array:
     return np.sum(np.conj(expected) * measured, axis=(1, 2)) / power
 
 
+def _is_loud(known: Snapshots, name: str) -> BoolArray:
+    """Return at which epochs a beacon's field is measured, shape (n,)."""
+    samples = known.samples
+    own = np.array([beacon == name for beacon, _ in samples.channels])
+    power = np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=2)
+    noise = 2.0 * np.trace(samples.phasor_cov, axis1=2, axis2=3)
+    field, others = np.sum(power[:, own], axis=1), np.max(power[:, ~own], axis=1, initial=0.0)
+    is_field = field > LOUD**2 * np.nansum(noise[:, own], axis=1)
+    return np.asarray(is_field & (field > LEAKING**2 * others))
+
+
 def _rewired(beacon: Beacon) -> Iterator[tuple[str, Beacon]]:
     def reversed_(which: set[int]) -> Beacon:
         return replace(
@@ -342,12 +354,18 @@ def _rewired(beacon: Beacon) -> Iterator[tuple[str, Beacon]]:
         yield f"the coils of beacon {beacon.name} are exchanged", coils_exchanged(beacon)
 
 
-def _turns() -> Iterator[Array]:
-    """Yield no turn, then quarter and half turns about each axis."""
-    yield np.eye(3)
+def _placed(beacon: Beacon) -> Iterator[Beacon]:
+    """Yield a beacon as surveyed, by quarter and half turns, and with a usual slip of its place."""
+    yield beacon
     for angle in (np.pi, 0.5 * np.pi, -0.5 * np.pi):
         for axis in np.eye(3):
-            yield Rotation.from_rotvec(angle * axis).as_matrix()
+            turn = Rotation.from_rotvec(angle * axis).as_matrix()
+            yield replace(beacon, world_from_beacon=beacon.world_from_beacon @ turn)
+    for k in range(3):
+        sign, order = np.ones(3), np.arange(3)
+        sign[k], order[[k, k - 1]] = -1.0, order[[k - 1, k]]
+        yield replace(beacon, position_world=sign * beacon.position_world)
+        yield replace(beacon, position_world=beacon.position_world[order])
 
 
 def _explained(

@@ -68,8 +68,8 @@ class Explanation:
         return enough and self.fall > LEAST_FALL and clearly
 
     def as_well_as(self, other: "Explanation") -> bool:
-        """Return whether it leaves hardly more than another."""
-        return self.after < ALIKE * other.after + LEAST_FALL / 2.0
+        """Return whether it leaves hardly more than another, or no more than noise."""
+        return self.after < max(ALIKE * other.after + LEAST_FALL / 2.0, self.expected)
 
     def rivalled_by(self, other: "Explanation") -> bool:
         """Return whether another would be another answer."""
