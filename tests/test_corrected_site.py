@@ -111,6 +111,13 @@ def test_what_snapshots_estimate_is_estimated_from_the_whole_log() -> None:
     sigma = result.site.beacons[0].sigma
     np.testing.assert_allclose(sigma.position_world, 0.5, rtol=1e-9)  # m
     np.testing.assert_array_equal(sigma.rotation_beacon, first.sigma.rotation_beacon)
+    # Of two beacons that are off, what is common is as uncertain as each of them was wrong.
+    second, *rest = others
+    low = replace(second, position_world=second.position_world - np.array([0.0, 0.3, 0.4]))
+    both = released(estimate._replace(site=replace(site, beacons=(moved, low, *rest))), SITE, None)
+    assert [block.owner for block in both.released] == [first.name, second.name]
+    for beacon in both.site.beacons[:2]:
+        np.testing.assert_allclose(beacon.sigma.position_world, 0.5 * np.sqrt(2.0), rtol=1e-9)  # m
     chosen = estimate._replace(is_estimate=False)
     assert released(chosen, SITE, None) is chosen
 

@@ -1,6 +1,6 @@
 """Sites in which a mistake is undone."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from magfusion.model.parameters import (
     initial_calibration,
     placed,
 )
+from magfusion.model.parameters.beacon import BeaconParameter
 from magfusion.model.parameters.inertial import (
     ACCEL_BIAS,
     ACCEL_SCALE,
@@ -124,45 +125,48 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
 
 
 def released_blocks(fault: Suspect) -> tuple[Block, ...]:
-    """Return the blocks of a candidate fault if a site can declare their sigmas, of one owner.
+    """Return the blocks of a candidate fault if a site can declare their sigmas.
 
-    Those of all beacons at once are, in part, the frame of the survey: no log determines it.
+    They are of one owner, or of beacons.
     """
     blocks = fault.blocks
     whole = fault.combine.shape[1] == sum(len(block.sigma) for block in blocks)
-    single = len({block.owner for block in blocks}) == 1
     declarable = all(block.parameter.declared for block in blocks)
-    return blocks if whole and single and declarable and not fault.code else ()
+    alike = _are_estimated_together(blocks)
+    return blocks if whole and alike and declarable and not fault.code else ()
 
 
 def estimated_blocks(declared: Site, corrected: Site) -> tuple[Block, ...]:
-    """Return the blocks whose values differ between two sites, if they are of one owner.
+    """Return the blocks whose values differ between two sites, if of one owner or of beacons.
 
-    The sigma of each is the size of the difference, at least as declared.
+    The sigma of each is the size of the difference.
     """
     before, after = (initial_calibration(site, 0.0) for site in (declared, corrected))
     blocks = []
     for parameter, owner in candidates(declared):
-        size = np.linalg.norm(parameter.difference(before, after, owner))
-        if parameter.declared and size > 0.0:
-            sigma = np.maximum(parameter.sigma(declared, owner), size)
+        step = parameter.difference(before, after, owner)
+        if parameter.declared and step.any():
+            sigma = np.full(len(step), np.linalg.norm(step))
             blocks.append(Block(parameter, owner, slice(0), sigma))
-    return placed(blocks) if len({block.owner for block in blocks}) == 1 else ()
+    return placed(blocks) if _are_estimated_together(blocks) else ()
 
 
-def wide_sigmas(site: Site, blocks: tuple[Block, ...], step: Array) -> list[Array]:
-    """Return the sigmas by which parameters are as uncertain as they were wrong.
+def _are_estimated_together(blocks: Sequence[Block]) -> bool:
+    of_beacons = all(isinstance(block.parameter, BeaconParameter) for block in blocks)
+    return of_beacons or len({block.owner for block in blocks}) == 1
 
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        Of all fixed parameters, in typical errors.
+
+def wide_sigmas(site: Site, blocks: tuple[Block, ...], sizes: Sequence[float]) -> list[Array]:
+    """Return the sigmas of parameters that were wrong by some sizes, at least as declared.
+
+    Where several beacons are wrong, so may be what is common to them, which no log shows: that is
+    as uncertain as each of them was wrong.
     """
+    total: dict[Parameter, float] = {}
+    for block, size in zip(blocks, sizes, strict=True):
+        total[block.parameter] = float(np.hypot(total.get(block.parameter, 0.0), size))
     return [
-        np.maximum(
-            block.parameter.sigma(site, block.owner),
-            block.sigma * np.linalg.norm(step[block.columns]),
-        )
+        np.maximum(block.parameter.sigma(site, block.owner), total[block.parameter])
         for block in blocks
     ]
 

@@ -1,5 +1,6 @@
 """Corrections: mistakes that explain a log, each with the site in which it is undone."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Generic, NamedTuple, TypeVar
@@ -226,12 +227,13 @@ def corrected_finding(
 def released(correction: Correction, declared: Site, groups: tuple[str, ...] | None) -> Correction:
     """Return a correction whose parameters are estimated, where their groups are (None: all)."""
     if correction.fault is not None and correction.step is not None:
-        blocks = released_blocks(correction.fault)
-        sigmas = wide_sigmas(correction.site, blocks, correction.step)
+        blocks, step = released_blocks(correction.fault), correction.step
+        sizes = [float(np.linalg.norm(one.sigma * step[one.columns])) for one in blocks]
     else:
         is_estimate = correction.fault is None and correction.is_estimate
         blocks = estimated_blocks(declared, correction.site) if is_estimate else ()
-        sigmas = [block.sigma for block in blocks]
+        sizes = [float(one.sigma[0]) for one in blocks]
+    sigmas = wide_sigmas(declared, blocks, sizes)
     if not blocks or (groups is not None and any(b.group not in groups for b in blocks)):
         return correction
     site = with_sigmas(initial_calibration(correction.site, 0.0), blocks, sigmas)
@@ -269,7 +271,10 @@ def as_estimated(
     if correction.words:
         text = finding.text.replace(correction.words, "; ".join(words))
         finding = replace(finding, text=text)
-    return correction._replace(finding=finding, site=with_sigmas(after, own, sigmas))
+    # A remedy has no correlations: what is common to several beacons stays as uncertain as it is.
+    kinds = Counter(block.parameter for block in own)
+    wide = [np.sqrt(kinds[b.parameter]) * s for b, s in zip(own, sigmas, strict=True)]
+    return correction._replace(finding=finding, site=with_sigmas(after, own, wide))
 
 
 def _other_frame(declared: Site, corrected: Site, probability: float) -> tuple[Rival, ...]:
