@@ -74,15 +74,16 @@ def _angles(change: Callable[[Array], Array]) -> Callable[[Beacon], Beacon]:
     return changed
 
 
-def _exchanged(*fields: str) -> Change:
-    """Return the mistake of taking A for B in some respects."""
+def _exchanged(*fields: str, count: int = 2) -> Change:
+    """Return the mistake of taking the first beacons for each other, in turn, in some respects."""
 
     def changed(case: Case) -> Case:
-        first, second, *rest = case.site.beacons
-        mine = {name: getattr(first, name) for name in fields}
-        others = {name: getattr(second, name) for name in fields}
-        beacons = (replace(first, **others), replace(second, **mine), *rest)
-        return declared(case, replace(case.site, beacons=beacons))
+        first, others = case.site.beacons[:count], case.site.beacons[count:]
+        beacons = (
+            replace(one, **{name: getattr(other, name) for name in fields})
+            for one, other in zip(first, (*first[1:], first[0]), strict=True)
+        )
+        return declared(case, replace(case.site, beacons=(*beacons, *others)))
 
     return changed
 
@@ -223,6 +224,9 @@ MISTAKES = (
         ("beacons_swapped",),
     ),
     Mistake("positions_swapped", "site", _exchanged("position_world"), ("beacons_swapped",)),
+    Mistake(
+        "frequencies_permuted", "site", _exchanged("frequency_hz", count=3), ("beacons_swapped",)
+    ),
     Mistake("frequencies_swapped", "site", _exchanged("frequency_hz"), ("beacons_swapped",)),
     Mistake(
         "frequency_off",
@@ -235,9 +239,16 @@ MISTAKES = (
     Mistake("moments_peak_to_peak", "site", of_beacons(_moments(2.0)), ("moment_units",)),
     Mistake("moments_one_turn", "site", of_beacons(_moments(0.01)), ("moment_units",)),
     Mistake("moments_A_3pct", "site", of_beacons(_moments(1.03), "A"), ("moments",)),
+    Mistake("moments_A_ten_times", "site", of_beacons(_moments(10.0), "A"), ("moments",)),
     Mistake("moments_A_20pct", "site", of_beacons(_moments(1.2), "A"), ("moments",)),
     Mistake("one_coil_10pct", "site", of_beacons(_moments(1.1, 1), "D"), ("moments",)),
     Mistake("moved_5cm", "site", of_beacons(_moved((0.03, -0.04, 0.0)), "A"), _PLACE),
+    Mistake(
+        "position_sign",
+        "site",
+        of_beacons(_placed(lambda p: p * np.array([-1.0, 1.0, 1.0])), "C"),
+        _PLACE,
+    ),
     Mistake("moved_50cm", "site", of_beacons(_moved((0.3, 0.4, 0.0)), "C"), _PLACE),
     Mistake("beacon_turned_10deg", "site", of_beacons(_rotated((6.0, 6.0, 5.0)), "B"), _PLACE),
     Mistake("beacon_turned_90deg", "site", of_beacons(_rotated((90.0, 0.0, 0.0)), "D"), _PLACE),

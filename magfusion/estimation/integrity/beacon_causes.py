@@ -249,7 +249,7 @@ def _moved(
         after, found = trial(place).fitted(free, fixes)
         if after < best:
             best, at = after, found
-        if best < 2.0 * known.freedom:
+        if best < known.freedom:
             break
     step = BEACON_POSITION.difference(known.calibration, at, name)
     angle = np.linalg.norm(BEACON_ROTATION.difference(known.calibration, at, name)) / DEGREE

@@ -1,16 +1,22 @@
 """Tests of the estimator's result: convergence, ambiguity and observability."""
 
+from collections.abc import Iterator
+
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.convergence import pose_steps
+from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.units import DEGREE, Array
 
 DIVERGED = 3.0  # whitened residual, one where noise and model are as declared
 MAX_FINAL_STEP_SIGMAS = (
     10.0  # sigmas of the last step of the poses, beyond which the result is arbitrary
 )
+ANY_ATTITUDE = np.pi / np.sqrt(3.0)  # rad; sigma of an angle of which nothing is known
 OPEN_DEG, OPEN_SHARE = 20.0, 0.25  # sigma of attitude, and of position over the distance of the
 # nearest beacon, beyond which a covariance does not describe where the platform may be
 
@@ -95,3 +101,26 @@ def geometry(case: Case) -> TestResult:
     verdict = Verdict.FAILED if lost_epochs else Verdict.DOUBTFUL
     weight = max(share / OPEN_SHARE, turn / OPEN_DEG)
     return TestResult((Finding("geometry", text, verdict, weight),))
+
+
+def too_wide(site: Site, pose_cov: Array) -> Iterator[Finding]:
+    """Yield that a result with its final covariance is as uncertain as the site is large.
+
+    Parameters
+    ----------
+    pose_cov : ndarray, shape (n, 6, 6)
+        Rotation and position, body axes (rad^2, rad m, m^2).
+    """
+    rotation, position = (
+        float(np.sqrt(np.median(np.trace(pose_cov[:, part, part], axis1=1, axis2=2)) / 3.0))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    places = np.array([beacon.position_world for beacon in site.beacons])
+    size = float(np.max(pdist(places))) if len(places) > 1 else np.inf
+    if position > size or rotation > ANY_ATTITUDE:
+        yield Finding(
+            "geometry",
+            f"The result is useless: its sigma is {position:.2g} m and {rotation / DEGREE:.2g} deg"
+            " an axis. Remove the other reasons and repeat.",
+            Verdict.FAILED,
+        )

@@ -56,6 +56,8 @@ SEEN = OF_SAMPLES | {
     "silent_beacon",
     "undeclared_line",
 }
+# As what a compass shows some mistakes, beside themselves.
+SHOWN_BY = {"accel_units": ("gravity_missing",), "imu_axes": ("gyro_sign", "gravity_sign")}
 CLEAR = 30.0  # ratio of chi square
 CAUSE_FIRST = 1e6  # weight: a cause comes before what it causes
 OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be beside it
@@ -111,7 +113,7 @@ def diagnosed(
     if said is None:
         return None
     one, text = said
-    if shown and one.code not in shown:
+    if shown and not shown & {one.code, *SHOWN_BY.get(one.code, ())}:
         return None
     parts = trust.verdict, log, site
     known = _diagnosis(one, text, *parts, several=several)

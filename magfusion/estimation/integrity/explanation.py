@@ -13,8 +13,9 @@ CLEARLY = 2.5  # times smaller than before must chi square be, and than with any
 SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
 PENALTY = 6.0  # of chi square, for each parameter that is found
 ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
-LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise,
-MOST_LEFT = 4.0  # but not more than this times expected: errors twice as large as declared
+# Or what is left is little of chi square before, as survey errors are more than noise: of a gross
+# mistake so much, of any other not more than errors twice as large as declared leave.
+LITTLE, VERY_LITTLE, MOST_LEFT = 0.04, 0.004, 4.0
 ALIKE = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
@@ -60,7 +61,8 @@ class Explanation:
     def clear(self) -> bool:
         """Whether it explains so much that it is worth saying."""
         little = min(LITTLE * self.before, MOST_LEFT * self.expected)
-        enough = self.after < max(ENOUGH * self.expected, little)
+        little = max(ENOUGH * self.expected, VERY_LITTLE * self.before, little)
+        enough = self.after < little
         # A bias or a lever arm that its prior holds back costs little, however sure it is.
         noise = max(self.after / max(self.expected, 1.0), 1e-9)
         significant = self.found > 0 and self.fall / self.found > SIGNIFICANT * noise

@@ -1,6 +1,6 @@
 """What people get wrong of beacons and magnetometer, tried on snapshots of the fields."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -20,6 +20,7 @@ from magfusion.units import DEGREE, Array
 GROSS = 4.0  # chi square over its freedom, below which no mistake in all beacons is sought
 SCREENED = 6  # epochs on which each is tried
 KEPT = 4  # of them, tried on all epochs
+MOST_PERMUTED = 5  # beacons, of which three may be permuted in 20 ways
 CORNERS = 12  # corner frequencies of a low-pass that are tried
 REACH = 1.0  # of the logarithm of a corner frequency, and of a delay in its radians
 REFINED = 1e-4  # of the logarithm of chi square; a step that decreases it by less is the last
@@ -235,28 +236,43 @@ def _other_axes() -> Iterator[tuple[str, Array]]:
 
 
 def _exchanges(site: Site) -> Iterator[Way]:
-    """Yield sites in which two beacons are taken for each other."""
-    for i, j in combinations(range(len(site.beacons)), 2):
-        one, other = site.beacons[i], site.beacons[j]
-        pair = f"beacons {one.name} and {other.name}"
-        ways = {
-            f"{pair} are exchanged (or their frequencies are)": (
-                "position_world",
-                "world_from_beacon",
-            ),
-            f"the positions of {pair} are exchanged": ("position_world",),
-            f"the attitudes of {pair} are exchanged": ("world_from_beacon",),
-        }
+    """Yield sites in which two beacons, or three in turn, are taken for each other."""
+    count = len(site.beacons)
+    orders: list[tuple[int, ...]] = [*combinations(range(count), 2)]
+    if count <= MOST_PERMUTED:
+        for i, j, k in combinations(range(count), 3):
+            orders += [(i, j, k), (i, k, j)]
+    pose: tuple[str, ...] = ("position_world", "world_from_beacon")
+    for order in orders:
+        names = _listed([site.beacons[k].name for k in order])
+        ways = {f"beacons {names} are exchanged (or their frequencies are)": pose}
+        if len({_kind_of_coils(site.beacons[k]) for k in order}) == 1:
+            ways[f"the frequencies of beacons {names} are exchanged"] = (*pose, "coils")
+        if len(order) == 2:
+            ways[f"the positions of beacons {names} are exchanged"] = pose[:1]
+            ways[f"the attitudes of beacons {names} are exchanged"] = pose[1:]
         for cause, fields in ways.items():
             beacons = list(site.beacons)
-            beacons[i] = replace(one, **{name: getattr(other, name) for name in fields})
-            beacons[j] = replace(other, **{name: getattr(one, name) for name in fields})
+            for here, there in zip(order, (*order[1:], order[0]), strict=True):
+                other = site.beacons[there]
+                beacons[here] = replace(
+                    beacons[here], **{name: getattr(other, name) for name in fields}
+                )
             yield Way(
                 "beacons_swapped",
                 cause,
                 "Check which beacon is where, and at which frequency.",
                 replace(site, beacons=tuple(beacons)),
             )
+
+
+def _kind_of_coils(beacon: Beacon) -> tuple[tuple[float | None, int | None], ...]:
+    """Return by what the tones of coils differ, beside the beacon's frequency."""
+    return tuple((coil.frequency_hz, coil.slot) for coil in beacon.coils)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _every(site: Site, change: Callable[[Beacon], Beacon]) -> Site:

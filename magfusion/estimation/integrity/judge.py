@@ -15,7 +15,12 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import detected_in
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.integrity.change_detection import candidate_steps, changed
-from magfusion.estimation.integrity.convergence_report import convergence, geometry, rivals
+from magfusion.estimation.integrity.convergence_report import (
+    convergence,
+    geometry,
+    rivals,
+    too_wide,
+)
 from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.region_test import of_place
@@ -116,7 +121,10 @@ def judged_with_score(result: R, log: Log, online: Site | None = None) -> Judged
         trust |= Trust(findings.findings, findings.unverified)
         factor = factor if findings.factor is None else np.maximum(factor, findings.factor)
         spread = spread if findings.spread is None else spread + findings.spread
-    widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
+    final_cov = factor[:, None, None] * pose_cov + spread
+    widened = replace(result.states, pose_cov=final_cov)
+    if online is None:
+        trust |= Trust(tuple(too_wide(result.declared.site, final_cov)))
     score = score if in_region is None else in_region
     return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
 
