@@ -46,6 +46,7 @@ ROOMS = {
             site_casing site_correlation site_motion site_region site_rotor
             site_temperature
             log_header row_stamps steel_file steel_map trajectory_table wells_file
+            clock_steps
             bag fix_table marks_table readings_table result_states
             site_plain site_text
             aiding_tables record_values site_response tum

@@ -15,11 +15,12 @@ from magfusion.files.aiding_messages import SensorMessages, aiding_rows
 from magfusion.files.bag_reader import open_bag, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.bag_topics import Topics
+from magfusion.files.clock_steps import ClockSetBack, clock_set_back
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
+from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, stray_finding
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.aiding import AidingSamples, AidingSensor
@@ -41,7 +42,7 @@ _NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of 
 class _Stream:
     """Messages of one topic as numbers, sorted by the stamps of their headers.
 
-    `name`: of its role in reports.
+    `name`: of its role in reports. `set_back`: where its clock was set back.
     """
 
     name: str
@@ -49,8 +50,11 @@ class _Stream:
     time_ns: IntArray
     values: Array
     noticed: tuple[Finding, ...] = ()
+    set_back: ClockSetBack | None = None
 
     def within(self, span: Span) -> _Stream:
+        if self.set_back is not None:
+            _refuse_step(self.place, self.set_back, span)
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
         return replace(self, time_ns=self.time_ns[begin:end], values=self.values[begin:end])
 
@@ -149,7 +153,7 @@ def _read(
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
         stream = _Stream(_NAMES.get(role, role), one.place, stamps, values)
         # A receiver of GNSS has no fix for long: what is absent there is no mistake of recording.
-        result[role] = _own_times(_sorted(stream if role in ROWS else _with_values(stream)))
+        result[role] = _in_order(stream if role in ROWS else _with_values(stream))
     return result
 
 
@@ -230,33 +234,37 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
         raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
-def _sorted(stream: _Stream) -> _Stream:
-    stamps, values = stream.time_ns, stream.values
-    if np.any(np.diff(stamps) < 0):
-        # A bag keeps the order of arrival, which the network may have changed.
-        order = np.argsort(stamps, kind="stable")
-        stamps, values = stamps[order], values[order]
-    bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1) & ~np.isnan(values).any(axis=1)
-    if bad.any():
-        stamp = stamps[np.argmax(bad)]
-        raise InputError(
-            f"{stream.place}: the message stamped {stamp} ns holds a number that is not finite;"
-            " remove the message."
-        )
-    return replace(stream, time_ns=stamps, values=values)
-
-
-def _own_times(stream: _Stream) -> _Stream:
-    """Return a stream with the times of its samples, where the stamps are others."""
-    stray = stray_rows(stream.time_ns)
+def _in_order(stream: _Stream) -> _Stream:
+    """Return a stream sorted by the times of its samples, where the stamps are others, too."""
+    # What is infinite is no measurement either.
+    values = np.where(np.abs(stream.values) < LARGEST_NUMBER, stream.values, np.nan)
+    stray = all_strays(stream.time_ns)
     noticed = stream.noticed + stray_finding(stream.name, stream.time_ns[stray])
-    kept = stream.time_ns[~stray], stream.values[~stray]
-    stream = _Stream(stream.name, stream.place, *kept, noticed)
-    separate = separate_stamps(stream.time_ns, stream.values)
-    if separate is None:
-        return stream
-    noticed += (batches_finding(stream.name, stream.time_ns),)
-    return replace(stream, time_ns=separate, noticed=noticed)
+    time_ns, values = stream.time_ns[~stray], values[~stray]
+    step = clock_set_back(time_ns, values)
+    if step is not None:
+        step = step._replace(row=int(np.flatnonzero(~stray)[step.row]))
+    # A bag keeps the order of arrival, which the network may have changed.
+    order = np.argsort(time_ns, kind="stable")
+    time_ns, values = time_ns[order], values[order]
+    separate = separate_stamps(time_ns, values)
+    if separate is not None:
+        noticed += (batches_finding(stream.name, time_ns),)
+        time_ns = separate
+    return _Stream(stream.name, stream.place, time_ns, values, noticed, step)
+
+
+def _refuse_step(place: str, step: ClockSetBack, span: Span) -> None:
+    """Refuse a span in which stamps are of two times, as the clock was set back."""
+    begin, end = span.bounds_ns
+    if begin > step.before_ns or end <= step.stamp_ns:
+        return
+    first, last = 1e3 * span.seconds(np.array([step.stamp_ns, step.before_ns]))  # ms
+    raise InputError(
+        f"{place}: the clock was set back by {step.size_s:.4g} s at message {step.row} (counted"
+        f" from 0), stamped {step.stamp_ns} ns; use one side by --end {np.floor(first) / 1e3:g} or"
+        f" --start {np.ceil(last + 1.0) / 1e3:g}."
+    )
 
 
 def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:

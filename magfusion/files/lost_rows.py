@@ -11,9 +11,21 @@ from magfusion.units import Array, BoolArray, IntArray
 MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
-class LostRows(NamedTuple):
-    """Rows without a sample, shape (n,): of repeated stamps, the later ones."""
+def copied_rows(time_ns: IntArray, values: Array) -> BoolArray:
+    """Return which of some rows, sorted by their stamps (ns), are the row above, written again."""
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return np.append(
+        np.zeros(min(1, len(time_ns)), bool), same.all(axis=1) & (np.diff(time_ns) == 0)
+    )
 
+
+class LostRows(NamedTuple):
+    """Rows without a sample, shape (n,): of repeated stamps, the later ones.
+
+    `copies`: rows that are the one above, written again. `twice`: others with its stamp.
+    """
+
+    copies: BoolArray
     twice: BoolArray
     absent: BoolArray
     beyond: BoolArray
@@ -24,29 +36,41 @@ class LostRows(NamedTuple):
 
         Where most are beyond the range, the unit is wrong: none of them is left out.
         """
-        twice = np.diff(time_ns, prepend=time_ns[:1] - 1) == 0
+        copies = copied_rows(time_ns, values)
+        twice = (np.diff(time_ns, prepend=time_ns[:1] - 1) == 0) & ~copies
         absent, beyond = np.isnan(values).any(axis=1), beyond_range(values)
         if np.sum(beyond) > MOST_MISSING * len(beyond):
             beyond[:] = False
-        return cls(np.asarray(twice), np.asarray(absent), beyond & ~absent)
+        return cls(
+            copies, np.asarray(twice), np.asarray(absent & ~copies), beyond & ~absent & ~copies
+        )
 
     @property
     def kept(self) -> BoolArray:
         """Which rows hold a sample, shape (n,)."""
-        return np.asarray(~(self.twice | self.absent | self.beyond))
+        return np.asarray(~(self.copies | self.twice | self.absent | self.beyond))
 
     @property
     def too_many(self) -> tuple[bool, bool]:
         """Whether repeated stamps and rows of NaN are too many for an accident."""
         if not len(self.twice):
             return False, False
-        return bool(np.mean(self.twice) > MOST_TWICE), bool(np.mean(self.absent) > MOST_MISSING)
+        count = np.sum(~self.copies)
+        return (
+            bool(np.sum(self.twice) > MOST_TWICE * count),
+            bool(np.sum(self.absent) > MOST_MISSING * count),
+        )
 
     def findings(self, stream: str) -> tuple[Finding, ...]:
         """Return how many rows are left out of a stream, and why."""
         return tuple(
             Finding(code, f"{stream}: {text} They are left out.", Verdict.TRUSTWORTHY)
             for code, rows, text in (
+                (
+                    "repeated_stamps",
+                    self.copies,
+                    f"{np.sum(self.copies)} samples are exact copies of others.",
+                ),
                 (
                     "repeated_stamps",
                     self.twice,

@@ -16,7 +16,7 @@ from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
 from magfusion.files.plain_table import refuse_damaged_text
-from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
+from magfusion.files.stray_stamps import LONGEST_GAP, all_strays
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
@@ -220,7 +220,7 @@ def read_table(
         raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
     whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
     time_ns = whole.integers(TIME)
-    if layout.strays and (stray := stray_rows(time_ns)).any():
+    if layout.strays and (stray := all_strays(time_ns)).any():
         rows = first_row + np.flatnonzero(stray)
         left_out = tuple(zip(rows.tolist(), time_ns[stray].tolist(), strict=True))
         whole = replace(whole, data=data.filter(pa.array(~stray)), stray=left_out)
