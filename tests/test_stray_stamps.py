@@ -114,6 +114,35 @@ def test_a_stray_stamp_of_a_log_is_left_out_wherever_its_row_is(
         read_log(tmp_path / "log")
 
 
+@pytest.mark.parametrize("stream", ["imu", "magnetometer", "truth"])
+def test_rows_of_a_log_that_were_written_twice_are_counted(tmp_path: Path, stream: str) -> None:
+    write_log(example_log(), tmp_path / "log")
+    before = read_log(tmp_path / "log")
+    path = tmp_path / "log" / f"{stream}.parquet"
+    table = pyarrow.parquet.read_table(path)
+    pyarrow.parquet.write_table(table.take(np.repeat(np.arange(len(table)), 2)), path)
+    log = read_log(tmp_path / "log")
+    (finding,) = log.noticed
+    assert finding.code == "repeated_stamps"
+    assert f": {len(table)} samples are exact copies of others" in finding.text
+    assert before.truth is not None
+    assert log.truth is not None
+    np.testing.assert_array_equal(log.imu.time, before.imu.time)
+    np.testing.assert_array_equal(log.truth.time, before.truth.time)
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e150])
+@pytest.mark.parametrize(("stream", "name"), [("imu", "gyro_z"), ("magnetometer", "field_x")])
+def test_an_infinite_sample_of_a_log_is_a_missing_one(
+    tmp_path: Path, stream: str, name: str, value: float
+) -> None:
+    write_log(example_log(), tmp_path / "log")
+    path = tmp_path / "log" / f"{stream}.parquet"
+    change_table(path, lambda columns: columns[name].__setitem__(3, value))
+    (finding,) = read_log(tmp_path / "log").noticed
+    assert (finding.code, "1 samples are NaN" in finding.text) == ("missing_samples", True)
+
+
 def test_a_clock_that_jumped_is_refused(tmp_path: Path, refuse: Refuse) -> None:
     def late(k: int) -> Any:
         message = imu_message(k)

@@ -1,5 +1,6 @@
 """Rows of a recording without a sample: NaN, beyond any range, or the stamp of the row above."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,16 @@ def copied_rows(time_ns: IntArray, values: Array) -> BoolArray:
     return np.append(
         np.zeros(min(1, len(time_ns)), bool), same.all(axis=1) & (np.diff(time_ns) == 0)
     )
+
+
+def copies_text(name: str, copies: BoolArray) -> str:
+    """Return how many rows of a stream or file are left out as they were written twice."""
+    return f"{name}: {np.sum(copies)} samples are exact copies of others. They are left out."
+
+
+def copies_findings(texts: Sequence[str]) -> tuple[Finding, ...]:
+    """Return findings with the texts of `copies_text`."""
+    return tuple(Finding("repeated_stamps", text, Verdict.TRUSTWORTHY) for text in texts)
 
 
 class LostRows(NamedTuple):

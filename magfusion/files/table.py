@@ -23,6 +23,7 @@ TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
 # Larger than any clock's reading, and far enough from the ends of int64 to subtract.
 LARGEST_TIME_NS = 1 << 62
+TWICE = "the time of the row above: remove one of the two"  # of a refused row
 LARGEST_NUMBER = 1e100  # whose square is still finite
 
 
@@ -136,7 +137,8 @@ class Table:
     def numbers(self, names: Sequence[str], *, nan: bool = False) -> Array:
         """Return columns side by side, shape (n, names); refuse what is not a finite number.
 
-        `nan`: whether a number may be missing: NaN or null in the table, NaN of what is returned.
+        `nan`: whether a number may be missing: NaN, infinite or null in the table, NaN of what is
+        returned.
         """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
@@ -144,8 +146,11 @@ class Table:
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()
-            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER) & ~(nan & np.isnan(values[:, k]))
-            self.refuse(bad, name, values[:, k], "write a finite number")
+            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)
+            if nan:
+                values[bad, k] = np.nan
+            else:
+                self.refuse(bad, name, values[:, k], "write a finite number")
         return values
 
     def integers(self, name: str) -> IntArray:
@@ -320,8 +325,7 @@ def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span
     step = np.diff(time_ns, prepend=time_ns[:1] - 1)
     whole.refuse(step < 0, TIME, time_ns, "which is before the row above: sort the rows by time")
     if not layout.repeats:
-        remedy = "the time of the row above: remove one of the two"
-        whole.refuse(step == 0, TIME, time_ns, remedy)
+        whole.refuse(step == 0, TIME, time_ns, TWICE)
     seconds = span.seconds(time_ns)
     merged = (np.diff(seconds, prepend=-np.inf) == 0.0) & (step > 0)
     remedy = (

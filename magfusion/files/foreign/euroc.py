@@ -22,6 +22,7 @@ from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
 from magfusion.files.foreign.units import NO_STAMP, Dimension, resolution_ns
 from magfusion.files.inertial_tables import read_imu, read_waveform
+from magfusion.files.lost_rows import copies_findings
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.files.table import Span, find_table
 from magfusion.files.trajectory_table import read_trajectory
@@ -69,14 +70,16 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         (None, ()) if field is None else read_waveform(field.path, span, field.content)
     )
     noticed = [finding for table in tables.values() for finding in table.noticed]
+    copies: list[str] = []
+    truth = _truth(tables.get("truth"), span, copies)
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
         imu=samples,
         waveform=waveform,
-        truth=_truth(tables.get("truth"), span),
-        noticed=(*noticed, *of_imu, *of_waveform),
+        truth=truth,
+        noticed=(*noticed, *of_imu, *of_waveform, *copies_findings(copies)),
     )
 
 
@@ -172,8 +175,8 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     return (Finding("stamp_resolution", text, _REMARK),)
 
 
-def _truth(table: _StreamTable | None, span: Span) -> Trajectory | None:
+def _truth(table: _StreamTable | None, span: Span, copies: list[str]) -> Trajectory | None:
     if table is None:
         return None
-    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content)
+    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, copies)
     return truth if len(truth) else None
