@@ -28,10 +28,13 @@ from test_bag_files import imported, recording
 
 from magfusion.errors import InputError
 from magfusion.files.clock_steps import clock_set_back
+from magfusion.files.foreign.convert import Counts
 from magfusion.files.log import read_log, write_log
 from magfusion.files.open import open_log
 from magfusion.files.stray_stamps import misplaced_rows, stray_rows
 from magfusion.jobs.check import CheckSettings, run_check
+from magfusion.jobs.import_figures import first_stamp_of
+from magfusion.jobs.import_log import _count_burst
 from magfusion.results.figures import Figures
 
 DAY, YEAR = 86_400, 31_536_000  # s
@@ -84,7 +87,7 @@ def test_a_stray_stamp_of_a_bag_is_left_out_and_reported(
         ):
             kept = np.delete(expected, row, axis=0) if name == topic else expected
             np.testing.assert_array_equal(values, kept)
-        assert one.epoch_ns == STAMPS[1 if (topic, row) == ("/imu", 0) else 0]
+        assert one.epoch_ns == STAMPS[0]
         assert one.imu.time[-1] < 0.2  # s
 
 
@@ -220,6 +223,7 @@ def test_a_single_stamp_seconds_away_is_left_out(
     for one in (log, by_import):
         assert one.waveform is not None
         assert one.truth is not None
+        assert one.epoch_ns == STAMPS[0]
         counts = {"/imu": len(one.imu), "/mag": len(one.waveform), "/pose": len(one.truth)}
         assert counts == dict.fromkeys(TOPICS, N) | {topic: N - 1}
 
@@ -262,3 +266,15 @@ def test_the_shared_bag_with_one_stamp_in_the_future_is_checked(tmp_path: Path) 
     imported(tmp_path / "log", bag)
     table = pyarrow.parquet.read_table(tmp_path / "log" / "magnetometer.parquet")
     assert len(table) == 2399
+
+
+def test_the_first_sample_of_bursts_is_the_epoch_of_an_import(tmp_path: Path) -> None:
+    step = 5_000_000
+    burst = np.arange(1200) // 10
+    stamps = 10 * step * (burst + 1) + 200_000 * (np.arange(1200) % 10)
+    for times, before_ms in ((stamps, 43.2), (step * np.arange(1200), 0.0)):
+        pyarrow.parquet.write_table(pyarrow.table({"time_ns": times}), tmp_path / "imu.parquet")
+        counts = Counts(first=int(times[0]))
+        _count_burst(tmp_path / "imu.parquet", counts)
+        assert 1e-6 * counts.before_ns == pytest.approx(before_ms, abs=0.1)
+        assert first_stamp_of({"imu": counts}) == times[0] - counts.before_ns

@@ -20,7 +20,7 @@ from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, stray_finding
+from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, counted_back, stray_finding
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.aiding import AidingSamples, AidingSensor
@@ -42,7 +42,8 @@ _NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of 
 class _Stream:
     """Messages of one topic as numbers, sorted by the stamps of their headers.
 
-    `name`: of its role in reports. `set_back`: where its clock was set back.
+    `name`: of its role in reports. `left_out`: stray samples before the first. `set_back`: where
+    its clock was set back.
     """
 
     name: str
@@ -50,6 +51,7 @@ class _Stream:
     time_ns: IntArray
     values: Array
     noticed: tuple[Finding, ...] = ()
+    left_out: int = 0
     set_back: ClockSetBack | None = None
 
     def within(self, span: Span) -> _Stream:
@@ -69,8 +71,9 @@ def read_bag(
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
-    Times are those of the messages' headers, and the first inertial one is the log's epoch, or the
-    first of the magnetometer where there is no inertial sensor. Poses are taken for those of the
+    Times are those of the messages' headers, and that of the first inertial sample is the log's
+    epoch, also where its stamp is stray, or that of the magnetometer's first where there is no
+    inertial sensor. Poses are taken for those of the
     IMU's axes in the world; the twist of an odometry is in body axes. Raises InputError where the
     bag cannot be read, has no topic of a sensor or several of one kind of which none was named, or
     holds messages that no instrument gives.
@@ -103,7 +106,7 @@ def read_bag(
             f"{path}: has no messages of {IMU} or {FIELD}; record the magnetometer, and the"
             " inertial sensor with it."
         )
-    span = Span(int(first.time_ns[0]), start, end)
+    span = Span(counted_back(first.time_ns, first.left_out), start, end)
     declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
     declared += [Finding("bag_damaged", note, Verdict.TRUSTWORTHY) for note in damage]
     imu, field, truth = (
@@ -251,7 +254,7 @@ def _in_order(stream: _Stream) -> _Stream:
     if separate is not None:
         noticed += (batches_finding(stream.name, time_ns),)
         time_ns = separate
-    return _Stream(stream.name, stream.place, time_ns, values, noticed, step)
+    return _Stream(stream.name, stream.place, time_ns, values, noticed, int(np.argmin(stray)), step)
 
 
 def _refuse_step(place: str, step: ClockSetBack, span: Span) -> None:

@@ -73,6 +73,16 @@ def all_strays(
     return stray
 
 
+def counted_back(time_ns: IntArray, count: int) -> int:
+    """Return the time of a stream's first sample (ns), of which the first were left out.
+
+    `time_ns` (n,): sorted stamps (ns) of the others. `count`: samples left out before them.
+    """
+    steps = np.diff(time_ns)
+    step = np.median(steps[steps > 0]) if np.any(steps > 0) else 0.0
+    return int(time_ns[0]) - round(count * float(step))
+
+
 def misplaced_rows(
     time_ns: IntArray, accepted_share: float = MOST_STRAY, accepted_rows: int = MOST_STRAY_ROWS
 ) -> BoolArray:

@@ -23,6 +23,7 @@ from magfusion.files.stray_stamps import (
     LONGEST_GAP,
     MOST_STRAY,
     MOST_STRAY_ROWS,
+    counted_back,
     misplaced_rows,
     stray_rows,
 )
@@ -63,6 +64,8 @@ class Counts:
     batches: str = ""
     # rows that were not written, by the reason
     left_out: dict[str, int] = field(default_factory=dict)
+    left_out_first: int = 0  # stray rows before the first
+    before_ns: int = 0  # from the first sample, whose stamp may be stray, to the first one written
     # first, last: stamps (ns)
     first: int = LARGEST_TIME_NS
     last: int = -LARGEST_TIME_NS
@@ -112,6 +115,9 @@ def write_stream(
                 report(counts.read)
     if counts.backward or counts.batched or counts.paused:
         _order(path, counts, plan)
+    if counts.written and counts.left_out_first:
+        stamps = pa.parquet.read_table(path, columns=[TIME_NS])[TIME_NS].to_numpy()
+        counts.before_ns = counts.first - counted_back(stamps, counts.left_out_first)
     _check(plan, counts)
     return counts
 
@@ -264,6 +270,8 @@ def _strays(stream: str, stamps: IntArray, counts: Counts) -> BoolArray:
     last = counts.last if counts.written else None
     stray = stray_rows(stamps, counts.written, last, *_accepted(stream, len(stamps)))
     counts.leave_out(STRAY, int(np.sum(stray)))
+    if not counts.written:
+        counts.left_out_first += int(np.argmin(np.append(stray, False)))
     return stray
 
 
@@ -304,6 +312,7 @@ def _order(path: Path, counts: Counts, plan: ImportPlan) -> None:
     stamps = table[TIME_NS].to_numpy()
     kept = np.flatnonzero(~misplaced_rows(stamps, *_accepted(plan.stream, len(stamps))))
     counts.leave_out(STRAY, len(stamps) - len(kept))
+    counts.left_out_first += int(kept[0])
     _refuse_step(plan, stamps[kept], values[kept], counts)
     counts.unsorted = int(np.sum(stamps[kept] < np.maximum.accumulate(stamps[kept])))
     kept = kept[np.argsort(stamps[kept], kind="stable")]

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from magfusion.errors import InputError
@@ -23,6 +24,7 @@ from magfusion.files.foreign.text import text_source
 from magfusion.files.foreign.units import NO_STAMP, Dimension, resolution_ns
 from magfusion.files.inertial_tables import read_imu, read_waveform
 from magfusion.files.lost_rows import copies_findings
+from magfusion.files.stray_stamps import all_strays, counted_back
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.files.table import Span, find_table
 from magfusion.files.trajectory_table import read_trajectory
@@ -60,8 +62,7 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     """
     tables = {stream: _read(stream, table) for stream, table in euroc_tables(path).items()}
     first = next(iter(tables.values()))
-    epoch_ns = first.content[TIME_NS][0].as_py() if len(first.content) else None
-    span = Span(epoch_ns or 0, start, end)
+    span = Span(_first_sample(first), start, end)
     imu, field = tables.get("imu"), tables.get("magnetometer")
     samples, of_imu = (
         (ImuSamples.empty(), ()) if imu is None else read_imu(imu.path, span, imu.content)
@@ -173,6 +174,15 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
         return ()
     text = f"{stream}: stamps are read as {term.unit}; their resolution is {size * 1e-3:.3g} us."
     return (Finding("stamp_resolution", text, _REMARK),)
+
+
+def _first_sample(table: _StreamTable) -> int:
+    """Return the time of a table's first sample (ns), also where its stamp is stray."""
+    stamps = table.content[TIME_NS].drop_null().to_numpy()
+    if not len(stamps):
+        return 0
+    stray = all_strays(stamps)
+    return counted_back(stamps[~stray], int(np.argmin(stray)))
 
 
 def _truth(table: _StreamTable | None, span: Span, copies: list[str]) -> Trajectory | None:
