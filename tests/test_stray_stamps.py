@@ -228,6 +228,30 @@ def test_a_single_stamp_seconds_away_is_left_out(
         assert counts == dict.fromkeys(TOPICS, N) | {topic: N - 1}
 
 
+@pytest.mark.parametrize("stamp", [0, int(STAMPS[3])])
+def test_messages_without_stamps_have_their_times_of_arrival(tmp_path: Path, stamp: int) -> None:
+    def unstamped(make: Make) -> Make:
+        def message(k: int) -> Any:
+            built = make(k)
+            built.header = header(stamp)
+            return built
+
+        return message
+
+    topics = {name: (kind, unstamped(make)) for name, (kind, make) in TOPICS.items()}
+    bag = write_bag(tmp_path / "run", topics)
+    by_import, figures = imported(tmp_path / "log", bag)
+    assert any(f"imu: all messages have the stamp {stamp} ns" in note for note in figures["notes"])
+    log = open_log(bag)
+    assert [finding.code for finding in log.noticed] == ["repeated_stamps"] * 3
+    for one in (log, by_import):
+        assert one.epoch_ns == 10**9
+        np.testing.assert_allclose(one.imu.time, 5e-3 * np.arange(N), rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(one.imu.gyro_body, GYRO)
+    by_rate, _ = imported(tmp_path / "rate", bag, rate_hz=("imu=100",))
+    np.testing.assert_allclose(by_rate.imu.time, 1e-2 * np.arange(N), rtol=0, atol=1e-9)
+
+
 def test_a_late_row_is_put_in_order_and_a_misplaced_one_is_not() -> None:
     stamps = 5_000_000 * np.arange(1000)
     late = np.r_[0:400, 401:450, 400, 450:1000]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.aiding_messages import SensorMessages, aiding_rows
 from magfusion.files.bag_reader import open_bag, refuse_overlap
-from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.bag_rows import Messages, Wanted, read_parts, unstamped_text
 from magfusion.files.bag_topics import Topics
 from magfusion.files.clock_steps import ClockSetBack, clock_set_back
 from magfusion.files.lost_rows import LostRows
@@ -153,8 +153,12 @@ def _read(
     for role, one in wanted.items():
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
-        stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        stream = _Stream(_NAMES.get(role, role), one.place, stamps, values)
+        messages = Messages(*map(np.concatenate, zip(*parts.pop(role), strict=True)))
+        stream = _Stream(_NAMES.get(role, role), one.place, messages.stamps, messages.values)
+        if messages.unstamped:
+            text = unstamped_text(stream.name, int(messages.stamps[0]))
+            noticed = (Finding("repeated_stamps", text, Verdict.TRUSTWORTHY),)
+            stream = replace(stream, time_ns=messages.arrived, noticed=noticed)
         # A receiver of GNSS has no fix for long: what is absent there is no mistake of recording.
         result[role] = _in_order(stream if role in ROWS else _with_values(stream))
     return result
@@ -171,7 +175,8 @@ def _with_values(stream: _Stream) -> _Stream:
     text = f"{stream.name}: {np.sum(absent)} of {len(absent)} messages have no value (no fix)."
     left_out = Finding("missing_samples", f"{text} They are left out.", Verdict.TRUSTWORTHY)
     there = stream.time_ns[~absent], stream.values[~absent]
-    return _Stream(stream.name, stream.place, *there, (left_out,) if absent.any() else ())
+    noticed = (*stream.noticed, *[left_out] * bool(absent.any()))
+    return _Stream(stream.name, stream.place, *there, noticed)
 
 
 def _of_sensor(reader: AnyReader, path: Path, sensor: AidingSensor) -> Wanted | None:
@@ -285,7 +290,8 @@ def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
         lost_epochs.too_many,
         (lost_epochs.twice, lost_epochs.absent),
         (
-            "have the stamp of another; stamp each message with its own time",
+            "have the stamp of another; stamp each with its own time, or import the bag with"
+            " --rate-hz TABLE=HZ",
             "hold NaN; record the topic again",
         ),
         strict=True,
