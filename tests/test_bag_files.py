@@ -147,6 +147,19 @@ def test_messages_that_two_bags_share_are_counted_once(tmp_path: Path, refuse: R
     assert re.search(sentence, refuse("import", folder, "-o", tmp_path / "log"))
 
 
+def test_a_folder_of_folders_of_bags_is_refused_by_how_to_give_them(
+    tmp_path: Path, refuse: Refuse
+) -> None:
+    (folder := tmp_path / "runs").mkdir()
+    parts = [
+        write_bag(folder / f"run_{k}", SENSORS, samples=samples)
+        for k, samples in enumerate((range(HALF), range(HALF, N)))
+    ]
+    sentence = f"holds 2 folders of bags; .*magfusion import {parts[0]} {parts[1]} -o LOG"
+    assert re.search(sentence, refuse("check", folder))
+    assert re.search(sentence, refuse("import", folder, "-o", tmp_path / "log"))
+
+
 def test_shared_folders_without_metadata_and_in_two_parts(tmp_path: Path) -> None:
     for name in ("dir_without_metadata", "ros1_bag_in_two"):
         log, _ = imported(tmp_path / name, recording(name))

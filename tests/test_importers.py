@@ -246,6 +246,11 @@ def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
             "found 'abc', which is no time in",
         ),
         ("imu0", "#t,a,b,c,d,e,f\n1,2,3,4,5,6,7\n,2,3,4,5,6,7\n", "row 1 .*found no value"),
+        (
+            "imu0",
+            "#t,a,b,c,d,e,f\n1,2,3,4,5,6,7\n1,3,3,4,5,6,7\n2,2,3,4,5,6,7\n",
+            "1 of 3 rows have the stamp of another: .*coarser than .*--rate-hz imu=HZ",
+        ),
         ("mag0", f"#t,a,b,c\n{START_NS},2e4,3e3,4e4\n", "divide nanotesla by 1e9"),
         ("mag0", f"#t\n{START_NS}\n", "columns field_x, field_y, field_z are missing"),
         ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,0,0,0,0\n", "found 0.0"),

@@ -25,6 +25,15 @@ def copies_text(name: str, copies: BoolArray) -> str:
     return f"{name}: {np.sum(copies)} samples are exact copies of others. They are left out."
 
 
+def coarse_text(place: str, stream: str, twice: int, count: int) -> str:
+    """Return the refusal of a table whose stamps are too often those of another row."""
+    return (
+        f"{place}: {twice} of {count} rows have the stamp of another: the times are coarser than"
+        f" the sampling; import the table with a finer column as {stream}.time, or with --rate-hz"
+        f" {stream}=HZ."
+    )
+
+
 def copies_findings(texts: Sequence[str]) -> tuple[Finding, ...]:
     """Return findings with the texts of `copies_text`."""
     return tuple(Finding("repeated_stamps", text, Verdict.TRUSTWORTHY) for text in texts)

@@ -15,7 +15,7 @@ from magfusion.files.foreign.columns import EULER, OPTIONAL_COLUMNS, QUATERNION,
 from magfusion.files.foreign.plan import ImportPlan
 from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
-from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows, copied_rows
+from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows, coarse_text, copied_rows
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.row_stamps import batches_text, separate_stamps
 from magfusion.files.stray_stamps import (
@@ -364,11 +364,7 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
         )
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MOST_TWICE * (counts.written + twice):
-        raise InputError(
-            f"{place}: {twice} of {counts.read} rows have the stamp of another: the times are"
-            f" coarser than the sampling; map a finer column to {stream}.time, or give --rate-hz"
-            f" {stream}=HZ."
-        )
+        raise InputError(coarse_text(place, stream, twice, counts.read))
     step = (counts.last - counts.first) * NANOSECOND / max(1, counts.written - 1)
     least, maximum = STEPS.get(stream, (0.0, np.inf))
     if counts.written > 1 and not least <= step <= maximum:
