@@ -92,7 +92,7 @@ def test_a_stray_stamp_of_a_bag_is_left_out_and_reported(
 
 
 @pytest.mark.parametrize("stream", ["imu", "magnetometer"])
-@pytest.mark.parametrize("shift_s", [DAY, -YEAR])
+@pytest.mark.parametrize("shift_s", [DAY, -YEAR, 60, -30])
 def test_a_stray_stamp_of_a_log_is_left_out_wherever_its_row_is(
     tmp_path: Path, stream: str, shift_s: int
 ) -> None:
