@@ -181,6 +181,19 @@ def test_a_clock_that_was_set_back_is_refused(
     assert open_log(bag, 0.096, 1.0).waveform is not None
 
 
+def test_a_log_of_a_clock_that_was_set_back_is_refused_by_its_place(tmp_path: Path) -> None:
+    log = example_log()
+    stamps = log.epoch_ns + 5_000_000 * np.arange(len(log.imu))
+
+    def set_back(columns: dict[str, Any]) -> None:
+        columns["time_ns"] = np.where(np.arange(len(stamps)) < 200, stamps, stamps - 50_000_000)
+
+    write_log(log, tmp_path / "log")
+    change_table(tmp_path / "log" / "imu.parquet", set_back)
+    with pytest.raises(InputError, match=r"imu\.parquet: .*row 200 .*was set back by 0\.05 s"):
+        read_log(tmp_path / "log")
+
+
 def test_a_step_back_is_distinguished_from_late_rows() -> None:
     rng = np.random.default_rng(2)
     step = 5_000_000

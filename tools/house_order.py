@@ -39,14 +39,13 @@ ROOMS = {
         "files": """
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
             plain_data plain_table plausible row_table site_draft site_ground
-            lost_rows site_values standard_streams stray_stamps
+            lost_rows clock_steps site_values standard_streams stray_stamps
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept
             probe row_file survey table yaml_files
             attitude_table audio distances drive_columns fields hall instruments
             site_casing site_correlation site_motion site_region site_rotor
             site_temperature
             log_header row_stamps steel_file steel_map trajectory_table wells_file
-            clock_steps
             bag fix_table marks_table readings_table result_states
             site_plain site_text
             aiding_tables record_values site_response tum

@@ -55,8 +55,6 @@ class _Stream:
     set_back: ClockSetBack | None = None
 
     def within(self, span: Span) -> _Stream:
-        if self.set_back is not None:
-            _refuse_step(self.place, self.set_back, span)
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
         return replace(self, time_ns=self.time_ns[begin:end], values=self.values[begin:end])
 
@@ -107,6 +105,7 @@ def read_bag(
             " inertial sensor with it."
         )
     span = Span(counted_back(first.time_ns, first.left_out), start, end)
+    _refuse_steps(result.values(), span)
     declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
     declared += [Finding("bag_damaged", note, Verdict.TRUSTWORTHY) for note in damage]
     imu, field, truth = (
@@ -262,12 +261,18 @@ def _in_order(stream: _Stream) -> _Stream:
     return _Stream(stream.name, stream.place, time_ns, values, noticed, int(np.argmin(stray)), step)
 
 
-def _refuse_step(place: str, step: ClockSetBack, span: Span) -> None:
+def _refuse_steps(streams: Collection[_Stream], span: Span) -> None:
     """Refuse a span in which stamps are of two times, as the clock was set back."""
     begin, end = span.bounds_ns
-    if begin > step.before_ns or end <= step.stamp_ns:
+    steps = [(one.place, step) for one in streams if (step := one.set_back) is not None]
+    steps = [one for one in steps if begin <= one[1].before_ns and end > one[1].stamp_ns]
+    if not steps:
         return
-    first, last = 1e3 * span.seconds(np.array([step.stamp_ns, step.before_ns]))  # ms
+    place, step = steps[0]
+    # The clock is one: its other streams may have stepped a sample earlier or later.
+    near = [s for _, s in steps if s.stamp_ns <= step.before_ns and s.before_ns >= step.stamp_ns]
+    bounds = [min(s.stamp_ns for s in near), max(s.before_ns for s in near)]
+    first, last = 1e3 * span.seconds(np.array(bounds))  # ms
     raise InputError(
         f"{place}: the clock was set back by {step.size_s:.4g} s at message {step.row} (counted"
         f" from 0), stamped {step.stamp_ns} ns; use one side by --end {np.floor(first) / 1e3:g} or"

@@ -14,6 +14,7 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.clock_steps import clock_set_back
 from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
 from magfusion.files.plain_table import refuse_damaged_text
 from magfusion.files.stray_stamps import LONGEST_GAP, all_strays
@@ -323,6 +324,10 @@ def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span
     far = np.abs(time_ns) > LARGEST_TIME_NS
     whole.refuse(far, TIME, time_ns, "write nanoseconds")
     step = np.diff(time_ns, prepend=time_ns[:1] - 1)
+    back = clock_set_back(time_ns, np.arange(float(len(time_ns)))[:, None])
+    if back is not None:
+        remedy = f"the clock was set back by {back.size_s:.4g} s: make a log of each part"
+        whole.refuse(np.arange(len(time_ns)) == back.row, TIME, time_ns, remedy)
     whole.refuse(step < 0, TIME, time_ns, "which is before the row above: sort the rows by time")
     if not layout.repeats:
         whole.refuse(step == 0, TIME, time_ns, TWICE)
