@@ -14,10 +14,11 @@ MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the rec
 
 def copied_rows(time_ns: IntArray, values: Array) -> BoolArray:
     """Return which of some rows, sorted by their stamps (ns), are the row above, written again."""
-    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
-    return np.append(
-        np.zeros(min(1, len(time_ns)), bool), same.all(axis=1) & (np.diff(time_ns) == 0)
-    )
+    result = np.zeros(len(time_ns), dtype=bool)
+    rows = np.flatnonzero(np.diff(time_ns) == 0) + 1
+    row, above = values[rows], values[rows - 1]
+    result[rows] = ((row == above) | (np.isnan(row) & np.isnan(above))).all(axis=1)
+    return result
 
 
 def copies_text(name: str, copies: BoolArray) -> str:

@@ -225,7 +225,8 @@ def _even_stamps(stamps: IntArray) -> IntArray | None:
 
 def _count_burst(path: Path, counts: Counts) -> None:
     """Add the time from the first sample of a stream to its stamp, where that is of a burst."""
-    stamps = pyarrow.parquet.read_table(path, columns=[TIME])[TIME].to_numpy()
+    with pyarrow.parquet.ParquetFile(path) as file:
+        stamps = file.read_row_group(0, columns=[TIME])[TIME].to_numpy()
     even = _even_stamps(stamps)
     # Within a step, a stamp is as good as the clock.
     if even is not None and even[0] < stamps[0] - (even[1] - even[0]):

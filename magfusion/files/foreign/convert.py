@@ -54,8 +54,9 @@ class Counts:
     unsorted: int = 0  # rows that were before one above, and were put in their place
     # whether many rows have the stamp of the row above: they are judged when all are read
     batched: bool = False
-    # whether two rows are far apart: the first or the last may be stray
+    # whether the first row is far from the second: it may be stray, as the last may be
     paused: bool = False
+    last_step: int = 0  # between the last two rows (ns)
     # stamps (ns) and numbers of rows that are before the row above
     backward: list[IntArray] = field(default_factory=list)
     # largest deviation of a quaternion's length from one, that was scaled to one
@@ -113,7 +114,8 @@ def write_stream(
             )
             if report is not None:
                 report(counts.read)
-    if counts.backward or counts.batched or counts.paused:
+    paused = counts.paused or counts.last_step * NANOSECOND > EDGE_S
+    if counts.backward or counts.batched or paused:
         _order(path, counts, plan)
     if counts.written and counts.left_out_first:
         stamps = pa.parquet.read_table(path, columns=[TIME_NS])[TIME_NS].to_numpy()
@@ -224,7 +226,9 @@ def _kept(
         rows = rows[~twice]
     # Rows out of order are judged, and doubles among them found, when all are read.
     steps = np.diff(stamps, prepend=before)
-    counts.paused |= bool(np.any(steps * NANOSECOND > EDGE_S))
+    if len(steps):
+        counts.last_step = int(steps[-1])
+        counts.paused |= not counts.written and bool(np.any(steps[1:2] * NANOSECOND > EDGE_S))
     if np.any(steps < 0):
         counts.backward.append(np.stack([stamps, rows])[:, steps < 0])
     counts.missing += int(np.sum(missing))
