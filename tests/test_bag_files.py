@@ -125,6 +125,41 @@ def test_bags_of_the_same_time_or_of_two_kinds_are_refused(tmp_path: Path, refus
         open_log(folder)
 
 
+def test_messages_that_two_bags_share_are_counted_once(tmp_path: Path, refuse: Refuse) -> None:
+    (folder := tmp_path / "run").mkdir()
+    write_ros1_bag(folder / "r_0.bag", SENSORS, range(30))
+    write_ros1_bag(folder / "r_1.bag", SENSORS, range(20, N))
+    log = open_log(folder)
+    assert_samples(log)
+    texts = [finding.text for finding in log.noticed]
+    expected = "{}: 10 samples are exact copies of others. They are left out."
+    assert texts == [expected.format(name) for name in ("IMU", "magnetometer")]
+    by_import, figures = imported(tmp_path / "log", folder)
+    assert_samples(by_import)
+    assert figures["imu_dropped_that_are_copies_of_others"] == 10
+    others = {
+        name: (kind, lambda k, m=make: m((k + 7) % N)) for name, (kind, make) in SENSORS.items()
+    }
+    (folder / "r_1.bag").unlink()
+    write_ros1_bag(folder / "r_1.bag", others, range(20, N))
+    sentence = r"r_0\.bag and .*r_1\.bag both hold /imu/data at the same time, from \d+ to \d+ ns"
+    assert re.search(sentence, refuse("check", folder))
+    assert re.search(sentence, refuse("import", folder, "-o", tmp_path / "log"))
+
+
+def test_a_folder_of_folders_of_bags_is_refused_by_how_to_give_them(
+    tmp_path: Path, refuse: Refuse
+) -> None:
+    (folder := tmp_path / "runs").mkdir()
+    parts = [
+        write_bag(folder / f"run_{k}", SENSORS, samples=samples)
+        for k, samples in enumerate((range(HALF), range(HALF, N)))
+    ]
+    sentence = f"holds 2 folders of bags; .*magfusion import {parts[0]} {parts[1]} -o LOG"
+    assert re.search(sentence, refuse("check", folder))
+    assert re.search(sentence, refuse("import", folder, "-o", tmp_path / "log"))
+
+
 def test_shared_folders_without_metadata_and_in_two_parts(tmp_path: Path) -> None:
     for name in ("dir_without_metadata", "ros1_bag_in_two"):
         log, _ = imported(tmp_path / name, recording(name))

@@ -118,6 +118,20 @@ def _names_itself(name: str, code: str) -> None:
     assert explanation.after < 0.4 * explanation.before
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "side"), [(1, "12 ms late"), (-1, "12 ms early")])
+def test_an_epoch_shift_says_its_side_and_the_remedy_of_a_bag(factor: int, side: str) -> None:
+    case = _short()
+    log = case.log
+    assert log.waveform is not None
+    wave = replace(log.waveform, time=log.waveform.time + 0.012 * factor)
+    imu = replace(log.imu, time=log.imu.time + 0.012 * factor)
+    result = cause_of(replace(log, waveform=wave, imu=imu), case.site)
+    assert result is not None
+    assert side in result[1]
+    assert "magfusion import --epoch NS" in result[1]
+
+
 @pytest.mark.parametrize("seed", [1])
 @pytest.mark.parametrize("motion", ["walk", "static"])
 def test_a_clean_log_names_none(motion: str, seed: int) -> None:

@@ -122,6 +122,10 @@ SPOILED: list[tuple[Callable[[list[list[str]]], object], str]] = [
     (_cell(7, 1, "ERR"), r"column Bx_nT, row 7 of the data .*found 'ERR'; write a number, or nan"),
     (_cell(7, 0, "noon"), r"column t_ms: found 'noon', which is no time in ms"),
     (lambda rows: _later(rows, 200, 4e6), r"time, row 200 .*4000\S* s after .*the clock jumped"),
+    (
+        lambda rows: _later(rows, 200, -50.0),
+        r"row 200 .*goes back by 0\.05 s: the clock was set ba",
+    ),
     (lambda rows: _later(rows, 200, -5e3), r"row 200 .*goes back by .*a counter wrapped around"),
     (
         lambda rows: [r.__setitem__(0, "") for r in rows],

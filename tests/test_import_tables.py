@@ -288,7 +288,7 @@ def test_rows_are_sorted_and_what_is_left_out_is_counted(tmp_path: Path) -> None
     counts = write_stream(plan, tmp_path / "m.parquet")
     assert (counts.read, counts.written, counts.missing, counts.unsorted) == (52, 50, 1, 1)
     assert counts.left_out == {
-        **{"without a time": 1, "with the stamp of another": 1},
+        **{"without a time": 1, "that are copies of others": 1},
         TORN: 1,
     }
     written = pa.parquet.read_table(tmp_path / "m.parquet")

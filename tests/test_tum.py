@@ -42,6 +42,17 @@ def test_evo_s_files_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.world_from_body, trajectory.world_from_body, atol=1e-8)
 
 
+def test_lines_that_were_written_twice_are_counted(tmp_path: Path) -> None:
+    trajectory, remarks = _trajectory(), list[str]()
+    write_tum(trajectory, path := tmp_path / "t.tum", 0)
+    path.write_text("".join(2 * line for line in path.read_text().splitlines(keepends=True)))
+    result = read_tum(path, 0, remarks)
+    np.testing.assert_allclose(result.time, trajectory.time, rtol=0, atol=1e-9)
+    assert remarks == [f"{path}: 4 samples are exact copies of others. They are left out."]
+    with pytest.raises(InputError, match="increasing times"):
+        read_tum(path)
+
+
 def test_nanoseconds_of_today_survive(tmp_path: Path) -> None:
     trajectory = _trajectory()
     write_tum(trajectory, tmp_path / "t.tum", EPOCH_NS)

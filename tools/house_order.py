@@ -39,8 +39,8 @@ ROOMS = {
         "files": """
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
             plain_data plain_table plausible row_table site_draft site_ground
-            site_values standard_streams stray_stamps
-            aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
+            lost_rows clock_steps site_values standard_streams stray_stamps
+            aiding_messages bag_reader bag_rows checkpoint correlation field_map kept
             probe row_file survey table yaml_files
             attitude_table audio distances drive_columns fields hall instruments
             site_casing site_correlation site_motion site_region site_rotor

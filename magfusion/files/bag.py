@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.aiding_messages import SensorMessages, aiding_rows
 from magfusion.files.bag_reader import open_bag, refuse_overlap
-from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.bag_rows import Messages, Wanted, read_parts, unstamped_text
 from magfusion.files.bag_topics import Topics
+from magfusion.files.clock_steps import ClockSetBack, clock_set_back
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
+from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, counted_back, stray_finding
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.aiding import AidingSamples, AidingSensor
@@ -41,7 +42,8 @@ _NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of 
 class _Stream:
     """Messages of one topic as numbers, sorted by the stamps of their headers.
 
-    `name`: of its role in reports.
+    `name`: of its role in reports. `left_out`: stray samples before the first. `set_back`: where
+    its clock was set back.
     """
 
     name: str
@@ -49,6 +51,8 @@ class _Stream:
     time_ns: IntArray
     values: Array
     noticed: tuple[Finding, ...] = ()
+    left_out: int = 0
+    set_back: ClockSetBack | None = None
 
     def within(self, span: Span) -> _Stream:
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
@@ -65,8 +69,9 @@ def read_bag(
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
-    Times are those of the messages' headers, and the first inertial one is the log's epoch, or the
-    first of the magnetometer where there is no inertial sensor. Poses are taken for those of the
+    Times are those of the messages' headers, and that of the first inertial sample is the log's
+    epoch, also where its stamp is stray, or that of the magnetometer's first where there is no
+    inertial sensor. Poses are taken for those of the
     IMU's axes in the world; the twist of an odometry is in body axes. Raises InputError where the
     bag cannot be read, has no topic of a sensor or several of one kind of which none was named, or
     holds messages that no instrument gives.
@@ -99,7 +104,8 @@ def read_bag(
             f"{path}: has no messages of {IMU} or {FIELD}; record the magnetometer, and the"
             " inertial sensor with it."
         )
-    span = Span(int(first.time_ns[0]), start, end)
+    span = Span(counted_back(first.time_ns, first.left_out), start, end)
+    _refuse_steps(result.values(), span)
     declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
     declared += [Finding("bag_damaged", note, Verdict.TRUSTWORTHY) for note in damage]
     imu, field, truth = (
@@ -146,10 +152,14 @@ def _read(
     for role, one in wanted.items():
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
-        stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        stream = _Stream(_NAMES.get(role, role), one.place, stamps, values)
+        messages = Messages(*map(np.concatenate, zip(*parts.pop(role), strict=True)))
+        stream = _Stream(_NAMES.get(role, role), one.place, messages.stamps, messages.values)
+        if messages.unstamped:
+            text = unstamped_text(stream.name, int(messages.stamps[0]))
+            noticed = (Finding("repeated_stamps", text, Verdict.TRUSTWORTHY),)
+            stream = replace(stream, time_ns=messages.arrived, noticed=noticed)
         # A receiver of GNSS has no fix for long: what is absent there is no mistake of recording.
-        result[role] = _own_times(_sorted(stream if role in ROWS else _with_values(stream)))
+        result[role] = _in_order(stream if role in ROWS else _with_values(stream))
     return result
 
 
@@ -164,7 +174,8 @@ def _with_values(stream: _Stream) -> _Stream:
     text = f"{stream.name}: {np.sum(absent)} of {len(absent)} messages have no value (no fix)."
     left_out = Finding("missing_samples", f"{text} They are left out.", Verdict.TRUSTWORTHY)
     there = stream.time_ns[~absent], stream.values[~absent]
-    return _Stream(stream.name, stream.place, *there, (left_out,) if absent.any() else ())
+    noticed = (*stream.noticed, *[left_out] * bool(absent.any()))
+    return _Stream(stream.name, stream.place, *there, noticed)
 
 
 def _of_sensor(reader: AnyReader, path: Path, sensor: AidingSensor) -> Wanted | None:
@@ -230,33 +241,43 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
         raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
-def _sorted(stream: _Stream) -> _Stream:
-    stamps, values = stream.time_ns, stream.values
-    if np.any(np.diff(stamps) < 0):
-        # A bag keeps the order of arrival, which the network may have changed.
-        order = np.argsort(stamps, kind="stable")
-        stamps, values = stamps[order], values[order]
-    bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1) & ~np.isnan(values).any(axis=1)
-    if bad.any():
-        stamp = stamps[np.argmax(bad)]
-        raise InputError(
-            f"{stream.place}: the message stamped {stamp} ns holds a number that is not finite;"
-            " remove the message."
-        )
-    return replace(stream, time_ns=stamps, values=values)
-
-
-def _own_times(stream: _Stream) -> _Stream:
-    """Return a stream with the times of its samples, where the stamps are others."""
-    stray = stray_rows(stream.time_ns)
+def _in_order(stream: _Stream) -> _Stream:
+    """Return a stream sorted by the times of its samples, where the stamps are others, too."""
+    # What is infinite is no measurement either.
+    values = np.where(np.abs(stream.values) < LARGEST_NUMBER, stream.values, np.nan)
+    stray = all_strays(stream.time_ns)
     noticed = stream.noticed + stray_finding(stream.name, stream.time_ns[stray])
-    kept = stream.time_ns[~stray], stream.values[~stray]
-    stream = _Stream(stream.name, stream.place, *kept, noticed)
-    separate = separate_stamps(stream.time_ns, stream.values)
-    if separate is None:
-        return stream
-    noticed += (batches_finding(stream.name, stream.time_ns),)
-    return replace(stream, time_ns=separate, noticed=noticed)
+    time_ns, values = stream.time_ns[~stray], values[~stray]
+    step = clock_set_back(time_ns, values)
+    if step is not None:
+        step = step._replace(row=int(np.flatnonzero(~stray)[step.row]))
+    # A bag keeps the order of arrival, which the network may have changed.
+    order = np.argsort(time_ns, kind="stable")
+    time_ns, values = time_ns[order], values[order]
+    separate = separate_stamps(time_ns, values)
+    if separate is not None:
+        noticed += (batches_finding(stream.name, time_ns),)
+        time_ns = separate
+    return _Stream(stream.name, stream.place, time_ns, values, noticed, int(np.argmin(stray)), step)
+
+
+def _refuse_steps(streams: Collection[_Stream], span: Span) -> None:
+    """Refuse a span in which stamps are of two times, as the clock was set back."""
+    begin, end = span.bounds_ns
+    steps = [(one.place, step) for one in streams if (step := one.set_back) is not None]
+    steps = [one for one in steps if begin <= one[1].before_ns and end > one[1].stamp_ns]
+    if not steps:
+        return
+    place, step = steps[0]
+    # The clock is one: its other streams may have stepped a sample earlier or later.
+    near = [s for _, s in steps if s.stamp_ns <= step.before_ns and s.before_ns >= step.stamp_ns]
+    bounds = [min(s.stamp_ns for s in near), max(s.before_ns for s in near)]
+    first, last = 1e3 * span.seconds(np.array(bounds))  # ms
+    raise InputError(
+        f"{place}: the clock was set back by {step.size_s:.4g} s at message {step.row} (counted"
+        f" from 0), stamped {step.stamp_ns} ns; use one side by --end {np.floor(first) / 1e3:g} or"
+        f" --start {np.ceil(last + 1.0) / 1e3:g}."
+    )
 
 
 def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
@@ -274,7 +295,8 @@ def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
         lost_epochs.too_many,
         (lost_epochs.twice, lost_epochs.absent),
         (
-            "have the stamp of another; stamp each message with its own time",
+            "have the stamp of another; stamp each with its own time, or import the bag with"
+            " --rate-hz TABLE=HZ",
             "hold NaN; record the topic again",
         ),
         strict=True,

@@ -16,6 +16,9 @@ from magfusion.files.bag_topics import UNFINISHED, bag_files, files_in
 
 # Of the files of one recording: what a recorder buffers, and of short ones a part.
 MOST_OVERLAP_NS, MOST_OVERLAP = 1_000_000_000, 0.5
+# Messages of an overlap, times those of one recording at most, and their least number: of two
+# recordings at the same time there are twice as many.
+MOST_DENSE, MIN_SHARED = 1.5, 10.0
 
 
 def place_of(paths: Sequence[Path]) -> str:
@@ -128,15 +131,31 @@ def _readable(path: Path) -> list[tuple[Path, Recovered]]:
 
 
 def refuse_overlap(reader: AnyReader, topic: str) -> None:
-    """Refuse files that hold a topic at the same time: they are no parts of one recording."""
-    spans = sorted(
-        (one.start_time, one.end_time, str(one.path))
-        for one in reader.readers
-        if any(c.topic == topic and c.msgcount for c in one.connections)
+    """Refuse files that hold a topic at the same time: they are no parts of one recording.
+
+    Short overlaps are those of a recorder's buffers, or of messages that both files have.
+    """
+    files = sorted(
+        (
+            (one, own)
+            for one in reader.readers
+            if (own := [c for c in one.connections if c.topic == topic and c.msgcount])
+        ),
+        key=lambda file: (file[0].start_time, file[0].end_time),
     )
-    for (start, end, first), (begin, last, second) in pairwise(spans):
-        shorter = min(end - start, last - begin)
-        if end - begin > min(MOST_OVERLAP_NS, MOST_OVERLAP * shorter):
+    for (first, of_first), (second, of_second) in pairwise(files):
+        begin, end = second.start_time, min(first.end_time, second.end_time)
+        shorter = min(one.end_time - one.start_time for one in (first, second))
+        if end <= begin:
+            continue
+        earlier, later = (
+            {raw for *_, raw in one.messages(own, begin, end)}
+            for one, own in ((first, of_first), (second, of_second))
+        )
+        usual = sum(c.msgcount for c in of_first) / (first.end_time - first.start_time)
+        twofold = len(earlier | later) > MOST_DENSE * max(MIN_SHARED, usual * (end - begin))
+        if end - begin > min(MOST_OVERLAP_NS, MOST_OVERLAP * shorter) or twofold:
             raise InputError(
-                f"{first} and {second} both hold {topic} at the same time; give the path of one."
+                f"{first.path} and {second.path} both hold {topic} at the same time, from"
+                f" {begin} to {end} ns; give the path of one."
             )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from magfusion.files.lost_rows import MOST_TWICE
 from magfusion.files.messages import (
     FIELD,
     IMU,
@@ -67,10 +68,25 @@ class Wanted(NamedTuple):
 
 
 class Messages(NamedTuple):
-    """Messages of a topic: stamps of their headers (ns), and their numbers, one row each."""
+    """Messages of a topic: stamps of headers and of arrival (ns), and a row of numbers each."""
 
     stamps: IntArray
     values: Array
+    arrived: IntArray
+
+    @property
+    def unstamped(self) -> bool:
+        """Whether all headers have one stamp, and times of arrival distinguish the messages."""
+        same = len(self.stamps) > 1 and bool(np.all(self.stamps == self.stamps[0]))
+        return same and bool(np.mean(np.diff(self.arrived) <= 0) <= MOST_TWICE)
+
+
+def unstamped_text(name: str, stamp_ns: int) -> str:
+    """Return that times of arrival are used for the messages of a stream, and why."""
+    return (
+        f"{name}: all messages have the stamp {stamp_ns} ns. Their times of arrival are used; stamp"
+        " each in its driver."
+    )
 
 
 def read_parts(
@@ -84,35 +100,37 @@ def read_parts(
     name_of = {c.topic: name for name, one in wanted.items() for c in one.connections}
     every = [c for one in wanted.values() for c in one.connections]
     waiting: dict[str, list[bytes]] = {name: [] for name in wanted}
+    times: dict[str, list[int]] = {name: [] for name in wanted}
     total, done = sum(c.msgcount for c in every), 0
-    for connection, _, raw in reader.messages(every) if every else ():
+    for connection, arrived, raw in reader.messages(every) if every else ():
         name = name_of[connection.topic]  # numbers repeat from file to file
         waiting[name].append(raw)
+        times[name].append(arrived)
         if len(waiting[name]) == PART:
             report("reading", done, total)
             done += PART
-            yield name, _part(reader, wanted[name], waiting[name])
-            waiting[name] = []
+            yield name, _part(reader, wanted[name], waiting[name], times[name])
+            waiting[name], times[name] = [], []
     for name, raws in waiting.items():
         if raws:
-            yield name, _part(reader, wanted[name], raws)
+            yield name, _part(reader, wanted[name], raws, times[name])
 
 
-def _part(reader: AnyReader, wanted: Wanted, raws: list[bytes]) -> Messages:
-    msgtype = wanted.connections[0].msgtype
-    first = _decoded(reader, wanted, msgtype, raws[:1])
+def _part(reader: AnyReader, wanted: Wanted, raws: list[bytes], times: list[int]) -> Messages:
+    msgtype, arrived = wanted.connections[0].msgtype, np.array(times, dtype=np.int64)
+    first = _decoded(reader, wanted, msgtype, raws[:1], arrived)
     cut = _cut(reader.is2, TAILS.get(msgtype), raws)
     if cut is None:
-        return _decoded(reader, wanted, msgtype, raws)
+        return _decoded(reader, wanted, msgtype, raws, arrived)
     stamps, doubles, tail = cut
     values = np.take(doubles, tail.read_rows, axis=1)
     shared = stamps[0] == first.stamps[0]
     if not (shared and np.array_equal(values[:1], first.values, equal_nan=True)):
-        return _decoded(reader, wanted, msgtype, raws)
+        return _decoded(reader, wanted, msgtype, raws, arrived)
     absent = np.flatnonzero((doubles[:, tail.absent] == -1.0).any(axis=1))
     if len(absent):
-        _decoded(reader, wanted, msgtype, [raws[absent[0]]])  # which refuses it
-    return Messages(stamps, values)
+        _decoded(reader, wanted, msgtype, [raws[absent[0]]], arrived)  # which refuses it
+    return Messages(stamps, values, arrived)
 
 
 def _cut(is2: bool, tail: Tail | None, raws: list[bytes]) -> tuple[IntArray, Array, Tail] | None:
@@ -133,7 +151,9 @@ def _cut(is2: bool, tail: Tail | None, raws: list[bytes]) -> tuple[IntArray, Arr
     return stamps, doubles.reshape(-1, tail.numbers), tail
 
 
-def _decoded(reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes]) -> Messages:
+def _decoded(
+    reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes], arrived: IntArray
+) -> Messages:
     """Return messages as the library reads them."""
     stamps, values = [], []
     for raw in raws:
@@ -141,4 +161,5 @@ def _decoded(reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes])
         refuse_absent(message, wanted.place)
         stamps.append(stamp_ns(message.header))
         values.append(wanted.row(message))
-    return Messages(np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64))
+    numbers = np.array(values, dtype=np.float64)
+    return Messages(np.array(stamps, dtype=np.int64), numbers, arrived)

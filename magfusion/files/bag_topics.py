@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from magfusion.errors import InputError
+
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 UNFINISHED = ".bag.active"  # as ROS 1 leaves a bag of which the recorder was killed
 
@@ -31,6 +33,17 @@ def bag_files(path: Path) -> list[Path]:
 def files_in(directory: Path) -> list[Path]:
     """Return the files of bags in a directory."""
     return sorted(p for p in directory.iterdir() if p.is_file() and _is_file_of_bag(p))
+
+
+def refuse_bag_folders(path: Path) -> None:
+    """Refuse a folder with folders of bags in it, by how these are given."""
+    folders = sorted(p for p in path.iterdir() if p.is_dir() and is_bag(p)) if path.is_dir() else []
+    if folders:
+        parts = " ".join(map(str, folders))
+        raise InputError(
+            f"{path}: holds {len(folders)} folders of bags; give one of them, or join parts of one"
+            f" recording by magfusion import {parts} -o LOG."
+        )
 
 
 def _is_file_of_bag(path: Path) -> bool:

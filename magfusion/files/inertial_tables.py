@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import angle_columns_of, column_names, current_columns_of
-from magfusion.files.lost_rows import LostRows
+from magfusion.files.lost_rows import LostRows, coarse_text
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.stray_stamps import stray_finding
@@ -103,8 +103,9 @@ def measured_rows(
     lost_epochs = LostRows.of(table.time_ns, values)
     too_often, too_many = lost_epochs.too_many
     if too_often:
-        remedy = "the time of the row above: remove one of the two"
-        table.refuse(lost_epochs.twice, TIME, table.time_ns, remedy)
+        twice = int(np.sum(lost_epochs.twice))
+        kind = stream.partition(" ")[0].lower()
+        raise InputError(coarse_text(str(table.path), kind, twice, len(table)))
     if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
         table.refuse(lost_epochs.absent, name, np.full(len(table), np.nan), "write a finite number")

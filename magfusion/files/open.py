@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from magfusion.errors import InputError
-from magfusion.files.bag_topics import Topics, is_bag
+from magfusion.files.bag_topics import Topics, is_bag, refuse_bag_folders
 from magfusion.files.log import read_log
 from magfusion.files.log_header import HEADER, is_log
 from magfusion.model.progress import Report, quiet
@@ -53,6 +53,7 @@ def open_log(
 
         aiding = () if site is None else site.aiding
         return read_bag(path, start, end, topics, report, aiding)
+    refuse_bag_folders(path)
     raise InputError(
         f"{path}: is no log: found neither {HEADER} nor the tables of a log, mav0/imu0/data.csv"
         " (EuRoC), or .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or convert"

@@ -1,4 +1,4 @@
-"""Single stamps that are hours or years from all others, of a clock that was not set yet."""
+"""Single stamps far from those of the samples around them: damaged, or of a clock not set yet."""
 
 from collections.abc import Sequence
 
@@ -10,6 +10,12 @@ from magfusion.units import NANOSECOND, BoolArray, IntArray
 LONGEST_GAP = 3600.0  # s; of a clock that did not jump
 # Share and number of rows that are left out as false; more are a part of the recording.
 MOST_STRAY, MOST_STRAY_ROWS = 0.01, 100
+MIN_ROWS = 10  # from which the step of a stream is known
+MOST_APART = 3.0  # steps between the rows around a stray one: its own place, and a lost row
+FAR = 10.0  # steps; a stamp that is less away may be one of jitter, or of a late message
+# s, steps; a first or last row that is more away: else it may be one before or after a pause
+EDGE_S, EDGE = 1.0, 20.0
+HOLE = 1.5  # steps between two rows, from which more a row is missing between them
 
 
 def stray_rows(
@@ -55,12 +61,78 @@ def stray_rows(
     return stray
 
 
+def all_strays(
+    time_ns: IntArray, accepted_share: float = MOST_STRAY, accepted_rows: int = MOST_STRAY_ROWS
+) -> BoolArray:
+    """Return which rows of a whole stream are stray, by `stray_rows` or `misplaced_rows`.
+
+    Parameters are those of the two; returns ndarray of bool, shape (n,).
+    """
+    stray = stray_rows(time_ns, 0, None, accepted_share, accepted_rows)
+    stray[~stray] = misplaced_rows(time_ns[~stray], accepted_share, accepted_rows)
+    return stray
+
+
+def counted_back(time_ns: IntArray, count: int) -> int:
+    """Return the time of a stream's first sample (ns), of which the first were left out.
+
+    `time_ns` (n,): sorted stamps (ns) of the others. `count`: samples left out before them.
+    """
+    steps = np.diff(time_ns)
+    step = np.median(steps[steps > 0]) if np.any(steps > 0) else 0.0
+    return int(time_ns[0]) - round(count * float(step))
+
+
+def misplaced_rows(
+    time_ns: IntArray, accepted_share: float = MOST_STRAY, accepted_rows: int = MOST_STRAY_ROWS
+) -> BoolArray:
+    """Return which single rows have a stamp that is neither of their place nor of another.
+
+    Without such a row its neighbours are about a step apart, and where its stamp belongs no row is
+    missing. A message that arrived late fills a hole there.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int, shape (n,)
+        Stamps (ns) in the order of arrival.
+    accepted_share, accepted_rows : float, int
+        As of `stray_rows`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None of them where they are too many for an accident.
+    """
+    stray = np.zeros(len(time_ns), dtype=bool)
+    if len(time_ns) < MIN_ROWS:
+        return stray
+    seconds = time_ns * NANOSECOND
+    steps = np.diff(seconds)
+    if not (np.any(steps < 0.0) or max(steps[0], steps[-1]) > EDGE_S) or not np.any(steps > 0.0):
+        return stray
+    step = float(np.median(steps[steps > 0.0]))
+    before = np.append(seconds[1] - 2.0 * step, seconds[:-1])
+    after = np.append(seconds[1:], seconds[-2] + 2.0 * step)
+    limit = np.full(len(seconds), FAR * step)
+    limit[[0, -1]] = max(EDGE_S, EDGE * step)
+    gap = after - before
+    away = np.maximum(before - seconds, seconds - after) > limit
+    candidate = away & (gap >= 0.0) & (gap <= MOST_APART * step)
+    others = np.concatenate([[-np.inf], np.sort(seconds[~candidate]), [np.inf]])
+    place = np.searchsorted(others, seconds[candidate])
+    below, above = seconds[candidate] - others[place - 1], others[place] - seconds[candidate]
+    fits = (below + above > HOLE * step) & (np.minimum(below, above) <= FAR * step)
+    if np.sum(~fits) <= min(max(1.0, accepted_share * len(time_ns)), accepted_rows):
+        stray[candidate] = ~fits
+    return stray
+
+
 def stray_finding(stream: str, stray_ns: Sequence[int] | IntArray) -> tuple[Finding, ...]:
     """Return how many rows are left out of a stream for their stamps (ns), if there are such."""
     if not len(stray_ns):
         return ()
     text = (
-        f"{stream}: {len(stray_ns)} samples have stamps more than an hour from those of all others"
+        f"{stream}: {len(stray_ns)} samples have stamps far from those of the samples around them"
         f" (the first is {stray_ns[0]} ns). They are left out."
     )
     return (Finding("stray_stamps", text, Verdict.TRUSTWORTHY),)

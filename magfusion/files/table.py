@@ -14,15 +14,17 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.clock_steps import clock_set_back
 from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
 from magfusion.files.plain_table import refuse_damaged_text
-from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
+from magfusion.files.stray_stamps import LONGEST_GAP, all_strays
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
 # Larger than any clock's reading, and far enough from the ends of int64 to subtract.
 LARGEST_TIME_NS = 1 << 62
+TWICE = "the time of the row above: remove one of the two"  # of a refused row
 LARGEST_NUMBER = 1e100  # whose square is still finite
 
 
@@ -136,7 +138,8 @@ class Table:
     def numbers(self, names: Sequence[str], *, nan: bool = False) -> Array:
         """Return columns side by side, shape (n, names); refuse what is not a finite number.
 
-        `nan`: whether a number may be missing: NaN or null in the table, NaN of what is returned.
+        `nan`: whether a number may be missing: NaN, infinite or null in the table, NaN of what is
+        returned.
         """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
@@ -144,8 +147,11 @@ class Table:
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()
-            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER) & ~(nan & np.isnan(values[:, k]))
-            self.refuse(bad, name, values[:, k], "write a finite number")
+            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)
+            if nan:
+                values[bad, k] = np.nan
+            else:
+                self.refuse(bad, name, values[:, k], "write a finite number")
         return values
 
     def integers(self, name: str) -> IntArray:
@@ -220,7 +226,7 @@ def read_table(
         raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
     whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
     time_ns = whole.integers(TIME)
-    if layout.strays and (stray := stray_rows(time_ns)).any():
+    if layout.strays and (stray := all_strays(time_ns)).any():
         rows = first_row + np.flatnonzero(stray)
         left_out = tuple(zip(rows.tolist(), time_ns[stray].tolist(), strict=True))
         whole = replace(whole, data=data.filter(pa.array(~stray)), stray=left_out)
@@ -318,10 +324,13 @@ def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span
     far = np.abs(time_ns) > LARGEST_TIME_NS
     whole.refuse(far, TIME, time_ns, "write nanoseconds")
     step = np.diff(time_ns, prepend=time_ns[:1] - 1)
+    back = clock_set_back(time_ns, np.arange(float(len(time_ns)))[:, None])
+    if back is not None:
+        remedy = f"the clock was set back by {back.size_s:.4g} s: make a log of each part"
+        whole.refuse(np.arange(len(time_ns)) == back.row, TIME, time_ns, remedy)
     whole.refuse(step < 0, TIME, time_ns, "which is before the row above: sort the rows by time")
     if not layout.repeats:
-        remedy = "the time of the row above: remove one of the two"
-        whole.refuse(step == 0, TIME, time_ns, remedy)
+        whole.refuse(step == 0, TIME, time_ns, TWICE)
     seconds = span.seconds(time_ns)
     merged = (np.diff(seconds, prepend=-np.inf) == 0.0) & (step > 0)
     remedy = (

@@ -1,12 +1,14 @@
 """Trajectories as tables: the truth of a log, and the estimate."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
+from magfusion.files.lost_rows import copied_rows, copies_text
+from magfusion.files.table import TIME, TWICE, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust
 from magfusion.units import Array, IntArray
@@ -78,14 +80,18 @@ def read_trajectory(
     start: float | None = None,
     end: float | None = None,
     content: pa.Table | None = None,
+    remarks: list[str] | None = None,
 ) -> Trajectory:
     """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
 
     A truth may have positions alone or attitudes alone; the other part is NaN then.
 
-    ``content`` as in `read_table`.
+    ``content`` as in `read_table`. ``remarks`` as in `magfusion.files.tum.read_tum`.
     """
-    table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), content)
+    layout = _LAYOUT._replace(repeats=remarks is not None)
+    table = read_table(path, layout, Span(epoch_ns, start, end), content)
+    if remarks is not None:
+        table = _without_copies(table, remarks)
     rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)
     if table.has(QUATERNION):
         rotation = unit_rotation(table).as_matrix()
@@ -99,6 +105,20 @@ def read_trajectory(
         accel_bias_body=_numbers(table, _ACCEL_BIAS),
         pose_cov=None if cov is None else _symmetric(cov),
     )
+
+
+def _without_copies(table: Table, remarks: list[str]) -> Table:
+    """Return a table without rows that were written twice; refuse others of one time."""
+    names = [name for name in table.data.column_names if name != TIME]
+    copies = copied_rows(table.time_ns, table.numbers(names, nan=True))
+    twice = (np.diff(table.time_ns, prepend=table.time_ns[:1] - 1) == 0) & ~copies
+    table.refuse(twice, TIME, table.time_ns, TWICE)
+    if not copies.any():
+        return table
+    remarks.append(copies_text(str(table.path), copies))
+    once = ~copies
+    data = table.data.filter(pa.array(once))
+    return replace(table, data=data, time_ns=table.time_ns[once], time=table.time[once])
 
 
 def unit_rotation(table: Table) -> Rotation:

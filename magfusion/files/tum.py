@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.lost_rows import copied_rows, copies_text
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.trajectory import Trajectory
@@ -36,10 +37,11 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
             stream.write(" ".join([time, *(f"{value:.9f}" for value in pose)]) + "\n")
 
 
-def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
+def read_tum(path: Path, epoch_ns: int = 0, remarks: list[str] | None = None) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
-    Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
+    Attitudes of a file with positions alone are NaN. `remarks`: if given, lines that were written
+    twice are left out and counted there. Raises InputError where the file is absent,
     not text, empty, a line does not hold eight finite numbers (or four, of positions alone: as many
     as the first line), a quaternion is not of unit length, or the times do not increase.
     """
@@ -47,6 +49,10 @@ def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
     values = np.array([_numbers(path, number, text, count) for number, text in lines])
     stamps = np.array([_stamp(path, number, text) for number, text in lines], dtype=np.int64)
+    if remarks is not None and (copies := copied_rows(stamps, values)).any():
+        remarks.append(copies_text(str(path), copies))
+        lines = [line for line, copy in zip(lines, copies, strict=True) if not copy]
+        values, stamps = values[~copies], stamps[~copies]
     time = Span(epoch_ns).seconds(stamps)
     for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
         _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")

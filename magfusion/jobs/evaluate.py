@@ -59,7 +59,7 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.results.report import error_figures
 
     true, epoch_ns, remarks = _read_truth(settings)
-    result = _read_estimate(settings, epoch_ns)
+    result = _read_estimate(settings, epoch_ns, remarks)
     with named(f"{settings.estimate} against {settings.truth}"):
         result, aligned = _aligned(settings, result, true)
         errors = error_figures(trajectory_errors(result, true))
@@ -68,14 +68,14 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | aligned | notes
 
 
-def _read_estimate(settings: EvaluateSettings, epoch_ns: int) -> Trajectory:
+def _read_estimate(settings: EvaluateSettings, epoch_ns: int, remarks: list[str]) -> Trajectory:
     """Return the poses of the frame that the truth tracks."""
     from magfusion.jobs.inputs import read_any_poses
     from magfusion.results.alignment import tracked_point
 
     lever = numbers("--lever-arm", settings.lever_arm, (3,))
     mounting = numbers("--mounting", settings.mounting, (3,))
-    estimate = read_any_poses(settings.estimate, epoch_ns)
+    estimate = read_any_poses(settings.estimate, epoch_ns, remarks)
     if not any((*lever, *mounting)):
         return estimate
     if not estimate.has_attitude:
@@ -117,14 +117,16 @@ def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int, list[str]]
     is_result = (path / "trajectory.parquet").is_file()
     ned = settings.truth_axes == "ned"
     if is_result or not (path.is_dir() or is_bag(path)):
-        poses = read_any_poses(path)
-        return from_ned(poses) if ned else poses, 0, []
+        remarks: list[str] = []
+        poses = read_any_poses(path, remarks=remarks)
+        return from_ned(poses) if ned else poses, 0, remarks
     log = open_log(path, topics=topics)
     if log.truth is None:
         raise InputError(f"{path}: has no truth; give a log with truth, a TUM file or a table")
     poses = from_ned(log.truth) if ned else log.truth
     findings = truth_findings(replace(log, truth=poses))
-    return poses, log.epoch_ns, [finding.text for finding in findings]
+    of_truth = [one.text for one in log.noticed if "truth" in one.text.partition(": ")[0]]
+    return poses, log.epoch_ns, [*of_truth, *(finding.text for finding in findings)]
 
 
 COMMAND = Command(EvaluateSettings, run_evaluate, example="magfusion evaluate run log")

@@ -20,8 +20,9 @@ LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 
 def first_stamp_of(counts: dict[str, Counts]) -> int:
-    """Return the first inertial stamp (ns), or that of another stream where there is none."""
-    return next(counts[name] for name in ("imu", *FIELD_STREAMS, *HALVES) if name in counts).first
+    """Return the time of the first inertial sample (ns), or of another stream's."""
+    first = next(counts[name] for name in ("imu", *FIELD_STREAMS, *HALVES) if name in counts)
+    return first.first - first.before_ns
 
 
 def import_figures(

@@ -27,7 +27,7 @@ from magfusion.jobs.import_figures import FIELD_STREAMS, first_stamp_of, import_
 from magfusion.jobs.settings import Command, Settings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures, Section, heading
-from magfusion.units import NANOSECOND
+from magfusion.units import NANOSECOND, IntArray
 
 FIRST = "first"
 
@@ -191,6 +191,8 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         note = "" if declared.problems else _with_imu(directory, counts)
         _refuse_apart(counts, declared)
         _refuse(declared)
+        if epoch == FIRST and "imu" in counts:
+            _count_burst(directory / "imu.parquet", counts["imu"])
         epoch_ns = first_stamp_of(counts) if epoch == FIRST else int(epoch)
         _write_header(directory, output, result, epoch_ns, audio)
         report("checking", 0, 1)
@@ -203,16 +205,32 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
 
 def _on_even_clock(path: Path) -> bool:
     """Replace stamps of bursts by those of the samples, between which a half is interpolated."""
-    from magfusion.receiver.sampling_clock import sampling_clock
-
     table = pyarrow.parquet.read_table(path)
-    stamps = table[TIME].to_numpy()
-    clock = sampling_clock((stamps - stamps[0]) * NANOSECOND)
-    if clock is None:
+    even = _even_stamps(table[TIME].to_numpy())
+    if even is None:
         return False
-    even = stamps[0] + np.rint(clock.time / NANOSECOND).astype(np.int64)
     write_table({name: table[name] for name in table.column_names} | {TIME: even}, path)
     return True
+
+
+def _even_stamps(stamps: IntArray) -> IntArray | None:
+    """Return stamps of a uniform clock (ns), or None if these scatter little about it."""
+    from magfusion.receiver.sampling_clock import sampling_clock
+
+    clock = sampling_clock((stamps - stamps[0]) * NANOSECOND)
+    if clock is None:
+        return None
+    return np.asarray(stamps[0] + np.rint(clock.time / NANOSECOND).astype(np.int64))
+
+
+def _count_burst(path: Path, counts: Counts) -> None:
+    """Add the time from the first sample of a stream to its stamp, where that is of a burst."""
+    with pyarrow.parquet.ParquetFile(path) as file:
+        stamps = file.read_row_group(0, columns=[TIME])[TIME].to_numpy()
+    even = _even_stamps(stamps)
+    # Within a step, a stamp is as good as the clock.
+    if even is not None and even[0] < stamps[0] - (even[1] - even[0]):
+        counts.before_ns += int(stamps[0] - even[0])
 
 
 def _report_stream(report: Report, stream: str, plan: ImportPlan, rows: int) -> None:

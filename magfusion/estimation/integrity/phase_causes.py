@@ -47,14 +47,16 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
             return
     shift = _shift(mean, tones_hz)
     shifted = _turned(known, -TWO_PI * tones_hz * shift)
+    side = "late" if shift > 0.0 else "early"
     yield _said(
         known,
         shifted,
         1,
         "epoch_shift",
-        f"all stamps are {1e3 * shift:.3g} ms late against the epoch of the drive phases"
+        f"all stamps are {1e3 * abs(shift):.3g} ms {side} against the epoch of the drive phases"
         " (or that and a whole number of the tones' common periods)",
-        "Correct epoch_ns of the log, or the delay of the magnetometer's stamps.",
+        "Correct epoch_ns of the log (of a bag or EuRoC folder by magfusion import --epoch NS), or"
+        " the delay of the magnetometer's stamps.",
     )
     if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
         yield _said(known, _turned(known, np.full(len(mean), np.pi)), 0, *left_handed())

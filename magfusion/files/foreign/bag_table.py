@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.bag_reader import open_bag, place_of, refuse_overlap
-from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.bag_rows import Messages, Wanted, read_parts, unstamped_text
 from magfusion.files.foreign.bag_transforms import (
     TRANSFORM_TYPES,
     composed_transforms,
@@ -55,7 +55,7 @@ class Topic:
 
 
 def first_stamp(paths: Sequence[Path], topic: str) -> int:
-    """Return the stamp of the first message of a topic (ns); without a header, its arrival.
+    """Return the stamp of the first message of a topic (ns); without one, its arrival.
 
     Raises InputError where the bag has no such topic.
     """
@@ -64,7 +64,7 @@ def first_stamp(paths: Sequence[Path], topic: str) -> int:
         for _, arrived, raw in reader.messages(connections) if connections else ():
             message: Any = reader.deserialize(raw, connections[0].msgtype)
             header = getattr(message, "header", None)
-            return int(arrived) if header is None else stamp_ns(header)
+            return int(arrived) if header is None else stamp_ns(header) or int(arrived)
         names = ", ".join(sorted({c.topic for c in reader.connections}))
     raise InputError(f"{place_of(paths)}: has no message of {topic} for --epoch (found {names}).")
 
@@ -286,8 +286,11 @@ def _rows(
             parts = composed_transforms(reader, topic.name, topic.frames or ("", ""))
         else:
             parts = (p for _, p in read_parts(reader, {role: Wanted(place, connections, row)}))
+        unstamped: bool | None = None
         for part in _joined(parts):
-            yield part.stamps, _complete(role, part.values)
+            if unstamped is None and (unstamped := part.unstamped) and notes is not None:
+                notes.append(unstamped_text(role, int(part.stamps[0])))
+            yield part.arrived if unstamped else part.stamps, _complete(role, part.values)
         if notes is not None:
             notes += [note for note in reader.damage if note not in notes]
 

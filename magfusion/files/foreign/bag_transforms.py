@@ -69,7 +69,7 @@ def composed_transforms(reader: AnyReader, topic: str, frames: Frames) -> Iterat
             own_turn = own_turn.inv()
             own_position = -own_turn.apply(own_position)
         position, turn = position + turn.apply(own_position), turn * own_turn
-    yield Messages(stamps, np.hstack([position, turn.as_quat()]))
+    yield Messages(stamps, np.hstack([position, turn.as_quat()]), stamps)
 
 
 def _topics(reader: AnyReader, topic: str) -> list[str]:

@@ -10,20 +10,28 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.clock_steps import clock_set_back
 from magfusion.files.foreign.columns import EULER, OPTIONAL_COLUMNS, QUATERNION, TIME, Term
 from magfusion.files.foreign.plan import ImportPlan
 from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
-from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows
+from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows, coarse_text, copied_rows
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.row_stamps import batches_text, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, MOST_STRAY, MOST_STRAY_ROWS, stray_rows
+from magfusion.files.stray_stamps import (
+    EDGE_S,
+    LONGEST_GAP,
+    MOST_STRAY,
+    MOST_STRAY_ROWS,
+    counted_back,
+    misplaced_rows,
+    stray_rows,
+)
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.model.counters import lost_by_wrapping
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
-MOST_BACK = 1.0  # s; further back, a clock was set or wrapped around
 STEPS = {  # s
     **dict.fromkeys(("imu", "gyro", "accel"), (SHORTEST_STEP, 0.5)),
     "magnetometer": (1e-6, 0.5),
@@ -31,6 +39,8 @@ STEPS = {  # s
 MOST_OFF = 0.01  # of a quaternion's length from one: rounding, or one that was interpolated
 FEW_OFF = 0.1  # of the rows, whose quaternions may be worse
 OTHER_CLOCK = 0.3  # of a truth's rows, that may be stamped by another clock
+# Reasons why rows are left out.
+STRAY, COPIES = "with a stray time", "that are copies of others"
 LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
@@ -41,18 +51,26 @@ class Counts:
     read: int = 0
     written: int = 0
     missing: int = 0  # rows written with NaN: samples that were not taken
-    unsorted: int = 0  # rows that were before the row above, and were put in their place
+    unsorted: int = 0  # rows that were before one above, and were put in their place
     # whether many rows have the stamp of the row above: they are judged when all are read
     batched: bool = False
+    # whether the first row is far from the second: it may be stray, as the last may be
+    paused: bool = False
+    last_step: int = 0  # between the last two rows (ns)
+    # stamps (ns) and numbers of rows that are before the row above
+    backward: list[IntArray] = field(default_factory=list)
     # largest deviation of a quaternion's length from one, that was scaled to one
     scaled: float = 0.0
     # what became of samples of which several have one stamp; empty where none did
     batches: str = ""
     # rows that were not written, by the reason
     left_out: dict[str, int] = field(default_factory=dict)
+    left_out_first: int = 0  # stray rows before the first
+    before_ns: int = 0  # from the first sample, whose stamp may be stray, to the first one written
     # first, last: stamps (ns)
     first: int = LARGEST_TIME_NS
     last: int = -LARGEST_TIME_NS
+    previous: int = 0  # stamp of the last row that was written (ns)
     # newest, wrapped: stamp of the last row that was read, and what its counter lost by wrapping
     # until then (ns)
     newest: int = -LARGEST_TIME_NS
@@ -96,8 +114,12 @@ def write_stream(
             )
             if report is not None:
                 report(counts.read)
-    if counts.unsorted or counts.batched:
-        _order(path, counts, plan.stream)
+    paused = counts.paused or counts.last_step * NANOSECOND > EDGE_S
+    if counts.backward or counts.batched or paused:
+        _order(path, counts, plan)
+    if counts.written and counts.left_out_first:
+        stamps = pa.parquet.read_table(path, columns=[TIME_NS])[TIME_NS].to_numpy()
+        counts.before_ns = counts.first - counted_back(stamps, counts.left_out_first)
     _check(plan, counts)
     return counts
 
@@ -193,18 +215,26 @@ def _kept(
     if not len(stamps):
         return stamps, values
     _refuse_jumps(plan, stamps, rows, counts)
-    before = counts.last if counts.written else int(stamps[0]) - 1
-    # Out of order within what was sent together; doubles are then found when all is sorted.
-    highest = np.maximum.accumulate(np.concatenate([[before], stamps]))[:-1]
-    counts.unsorted += int(np.sum(stamps < highest))
+    before = counts.previous if counts.written else int(stamps[0]) - 1
     twice: BoolArray = np.diff(stamps, prepend=before) == 0
     counts.batched |= not counts.written and bool(np.mean(twice) > MOST_TWICE)
     if not counts.batched:
-        counts.leave_out("with the stamp of another", int(np.sum(twice)))
+        copies = copied_rows(stamps, values)
+        counts.leave_out(COPIES, int(np.sum(copies)))
+        counts.leave_out("with the stamp of another", int(np.sum(twice & ~copies)))
         stamps, values, missing = stamps[~twice], values[~twice], missing[~twice]
+        rows = rows[~twice]
+    # Rows out of order are judged, and doubles among them found, when all are read.
+    steps = np.diff(stamps, prepend=before)
+    if len(steps):
+        counts.last_step = int(steps[-1])
+        counts.paused |= not counts.written and bool(np.any(steps[1:2] * NANOSECOND > EDGE_S))
+    if np.any(steps < 0):
+        counts.backward.append(np.stack([stamps, rows])[:, steps < 0])
     counts.missing += int(np.sum(missing))
     counts.written += len(stamps)
     if len(stamps):
+        counts.previous = int(stamps[-1])
         counts.first = min(counts.first, int(stamps.min()))
         counts.last = max(counts.last, int(stamps.max()))
     return stamps, values
@@ -241,11 +271,17 @@ def _strays(stream: str, stamps: IntArray, counts: Counts) -> BoolArray:
     """Return which rows have a stamp far from all others, and count them."""
     if not len(stamps):
         return np.zeros(0, dtype=bool)
-    accepted = (OTHER_CLOCK, len(stamps)) if stream == "truth" else (MOST_STRAY, MOST_STRAY_ROWS)
     last = counts.last if counts.written else None
-    stray = stray_rows(stamps, counts.written, last, *accepted)
-    counts.leave_out("with a stray time", int(np.sum(stray)))
+    stray = stray_rows(stamps, counts.written, last, *_accepted(stream, len(stamps)))
+    counts.leave_out(STRAY, int(np.sum(stray)))
+    if not counts.written:
+        counts.left_out_first += int(np.argmin(np.append(stray, False)))
     return stray
+
+
+def _accepted(stream: str, count: int) -> tuple[float, int]:
+    """Return share and number of rows that may be stray."""
+    return (OTHER_CLOCK, count) if stream == "truth" else (MOST_STRAY, MOST_STRAY_ROWS)
 
 
 def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
@@ -254,11 +290,6 @@ def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Co
     far = np.abs(stamps) > LARGEST_TIME_NS
     for bad, what in (
         (far, "is beyond any clock: another unit of time is probably meant"),
-        (
-            steps < -MOST_BACK,
-            "goes back by {size:.6g} s: the clock was set or a counter wrapped around; correct"
-            " the times, or import the parts one by one",
-        ),
         (
             steps > LONGEST_GAP,
             "is {size:.6g} s after the row above: the clock jumped; correct the times, or import"
@@ -273,26 +304,53 @@ def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Co
             )
 
 
-def _order(path: Path, counts: Counts, stream: str) -> None:
-    """Sort the rows by time, and give those of one stamp their own or leave them out."""
+def _order(path: Path, counts: Counts, plan: ImportPlan) -> None:
+    """Sort the rows by time, leave out stray ones and copies, and spread those of batches.
+
+    Raises InputError where the clock was set back.
+    """
     table = pa.parquet.read_table(path)
-    table = table.take(np.argsort(table[TIME_NS].to_numpy(), kind="stable"))
-    stamps = table[TIME_NS].to_numpy()
-    measured = [n for n in table.column_names[1:] if n not in OPTIONAL_COLUMNS.get(stream, {})]
+    optional = OPTIONAL_COLUMNS.get(plan.stream, {})
+    measured = [name for name in table.column_names[1:] if name not in optional]
     values = np.stack([table[name].to_numpy() for name in measured], axis=1)
+    stamps = table[TIME_NS].to_numpy()
+    kept = np.flatnonzero(~misplaced_rows(stamps, *_accepted(plan.stream, len(stamps))))
+    counts.leave_out(STRAY, len(stamps) - len(kept))
+    counts.left_out_first += int(kept[0])
+    _refuse_step(plan, stamps[kept], values[kept], counts)
+    counts.unsorted = int(np.sum(stamps[kept] < np.maximum.accumulate(stamps[kept])))
+    kept = kept[np.argsort(stamps[kept], kind="stable")]
+    table, stamps, values = table.take(kept), stamps[kept], values[kept]
+    copies, twice, *_ = LostRows.of(stamps, values)
     separate = separate_stamps(stamps, values)
     if separate is not None:
         counts.batches = batches_text(stamps)
-        counts.first = int(separate[0])
+        stamps = separate
         table = table.set_column(0, TIME_NS, pa.array(separate))
     else:
-        twice, absent, _ = LostRows.of(stamps, values)
+        counts.leave_out(COPIES, int(np.sum(copies)))
         counts.leave_out("with the stamp of another", int(np.sum(twice)))
-        counts.written -= int(np.sum(twice))
-        counts.missing -= int(np.sum(twice & absent))
-        table = table.filter(pa.array(~twice))
+        once = ~(copies | twice)
+        table, stamps, values = table.filter(pa.array(once)), stamps[once], values[once]
+    counts.first, counts.last, counts.written = int(stamps[0]), int(stamps[-1]), len(stamps)
+    counts.missing = int(np.sum(np.isnan(values).any(axis=1)))
     pa.parquet.write_table(
         table, path, compression="zstd", row_group_size=ROWS_PER_GROUP, write_page_checksum=True
+    )
+
+
+def _refuse_step(plan: ImportPlan, stamps: IntArray, values: Array, counts: Counts) -> None:
+    """Refuse rows, in the order of the file, of a clock that was set back."""
+    step = clock_set_back(stamps, values)
+    if step is None:
+        return
+    backward = np.concatenate(counts.backward, axis=1)
+    rows = backward[1][backward[0] == step.stamp_ns]
+    row = f", row {rows[-1]} of the data (counted from 0)" if len(rows) else ""
+    raise InputError(
+        f"{plan.source.place}: {plan.stream}.time{row}: {step.stamp_ns * NANOSECOND:.13g} s goes"
+        f" back by {step.size_s:.6g} s: the clock was set back or a counter wrapped around; correct"
+        " the times, or import the parts one by one."
     )
 
 
@@ -310,11 +368,7 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
         )
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MOST_TWICE * (counts.written + twice):
-        raise InputError(
-            f"{place}: {twice} of {counts.read} rows have the stamp of another: the times are"
-            f" coarser than the sampling; map a finer column to {stream}.time, or give --rate-hz"
-            f" {stream}=HZ."
-        )
+        raise InputError(coarse_text(place, stream, twice, counts.read))
     step = (counts.last - counts.first) * NANOSECOND / max(1, counts.written - 1)
     least, maximum = STEPS.get(stream, (0.0, np.inf))
     if counts.written > 1 and not least <= step <= maximum:

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from magfusion.errors import InputError
@@ -22,6 +23,8 @@ from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
 from magfusion.files.foreign.units import NO_STAMP, Dimension, resolution_ns
 from magfusion.files.inertial_tables import read_imu, read_waveform
+from magfusion.files.lost_rows import copies_findings
+from magfusion.files.stray_stamps import all_strays, counted_back
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.files.table import Span, find_table
 from magfusion.files.trajectory_table import read_trajectory
@@ -59,8 +62,7 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     """
     tables = {stream: _read(stream, table) for stream, table in euroc_tables(path).items()}
     first = next(iter(tables.values()))
-    epoch_ns = first.content[TIME_NS][0].as_py() if len(first.content) else None
-    span = Span(epoch_ns or 0, start, end)
+    span = Span(_first_sample(first), start, end)
     imu, field = tables.get("imu"), tables.get("magnetometer")
     samples, of_imu = (
         (ImuSamples.empty(), ()) if imu is None else read_imu(imu.path, span, imu.content)
@@ -69,14 +71,16 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         (None, ()) if field is None else read_waveform(field.path, span, field.content)
     )
     noticed = [finding for table in tables.values() for finding in table.noticed]
+    copies: list[str] = []
+    truth = _truth(tables.get("truth"), span, copies)
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
         imu=samples,
         waveform=waveform,
-        truth=_truth(tables.get("truth"), span),
-        noticed=(*noticed, *of_imu, *of_waveform),
+        truth=truth,
+        noticed=(*noticed, *of_imu, *of_waveform, *copies_findings(copies)),
     )
 
 
@@ -172,8 +176,17 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     return (Finding("stamp_resolution", text, _REMARK),)
 
 
-def _truth(table: _StreamTable | None, span: Span) -> Trajectory | None:
+def _first_sample(table: _StreamTable) -> int:
+    """Return the time of a table's first sample (ns), also where its stamp is stray."""
+    stamps = table.content[TIME_NS].drop_null().to_numpy()
+    if not len(stamps):
+        return 0
+    stray = all_strays(stamps)
+    return counted_back(stamps[~stray], int(np.argmin(stray)))
+
+
+def _truth(table: _StreamTable | None, span: Span, copies: list[str]) -> Trajectory | None:
     if table is None:
         return None
-    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content)
+    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, copies)
     return truth if len(truth) else None

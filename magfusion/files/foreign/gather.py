@@ -6,7 +6,7 @@ from pathlib import Path
 
 from magfusion.errors import InputError
 from magfusion.files.bag_reader import is_ros1
-from magfusion.files.bag_topics import is_bag
+from magfusion.files.bag_topics import is_bag, refuse_bag_folders
 from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
 from magfusion.files.foreign.columns import FIELDS, STREAMS, Undecided, place_of, terms_by_place
@@ -189,6 +189,7 @@ def _add(recording: Sequence[Path], wanted: ImportRequest, result: GatheredStrea
         return _add_flight(path, wanted, result)
     files = _tables_in(path) if path.is_dir() else [path]
     if not files:
+        refuse_bag_folders(path)
         raise InputError(
             f"{path}: holds no table ({', '.join((*TEXTS, *ARRAYS))}), no bag and no folder mav0;"
             " give the path of a source."
