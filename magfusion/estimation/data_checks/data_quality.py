@@ -10,6 +10,7 @@ from magfusion.estimation.data_checks.disturbing_lines import undeclared_lines
 from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
 from magfusion.estimation.data_checks.pauses import repeated_samples
+from magfusion.estimation.data_checks.range_step import range_step
 from magfusion.estimation.data_checks.samples import (
     clipped_samples,
     false_samples,
@@ -45,6 +46,7 @@ SAMPLE_TESTS: tuple[SampleTest, ...] = (
     wrapped_samples,
     false_samples,
     noisy_inertial,
+    range_step,
 )
 LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
 MOUNTED = 0.1  # rad; largest sigma of a mounting that is known
