@@ -9,7 +9,7 @@ from spoiled_log import burst_stamps
 
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.batches import spread_batches
-from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.samples import ImuSamples, Log, StreamClock, Waveform
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -210,3 +210,47 @@ def test_rounded_stamps_of_batches_are_counted(size: int) -> None:
     assert clock is not None
     off = clock.time[size:] - time[size:]
     assert np.max(np.abs(off - np.median(off))) < 0.05e-3  # s; of the stamps .5 ms
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1e-3, 0.06])  # of a step
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+@pytest.mark.parametrize(
+    ("period", "lost"), [(3, [2]), (4, [3]), (4, [2, 3]), (5, [3, 4]), (8, [7]), (10, [9])]
+)
+def test_periodic_losses_are_no_rounding(
+    period: int, lost: list[int], rate_hz: float, scatter: float
+) -> None:
+    """The steps are whole multiples of the shortest, to which no clock rounds."""
+    row = np.arange(COUNT)
+    selected = row[~np.isin(row % period, lost)] / rate_hz
+    stamps = selected + scatter / rate_hz * np.random.default_rng(4).standard_normal(len(selected))
+    clock, timed = sampling_clock(stamps), timing("imu", stamps)
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    assert timed.lost_share == pytest.approx(len(lost) / period, abs=0.01)
+    assert (clock is None) == (scatter < 0.01)
+    if clock is not None:
+        assert np.max(np.abs(clock.time - selected)) < 0.1 / rate_hz
+
+
+@pytest.mark.parametrize(("rate_hz", "resolution"), [(800.0, 1e-3), (900.0, 1e-3), (61.0, 1e-2)])
+def test_steps_of_one_and_two_milliseconds_are_of_rounded_stamps(
+    rate_hz: float, resolution: float
+) -> None:
+    stamps = resolution * np.rint(np.arange(COUNT) / rate_hz / resolution)
+    timed = timing("imu", stamps)
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    assert timed.lost_share == 0.0
+    assert timed.resolution == pytest.approx(resolution)
+
+
+def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
+    stamps = 1e-3 * np.arange(COUNT)[np.arange(COUNT) % 10 != 9]
+    wave = Waveform(stamps, np.ones((len(stamps), 3)))
+    note = StreamClock(1e-3 / 0.9, 3e-4, 0, replaced=False, resolution=1e-3)
+    log = Log("kept", 0, "", ImuSamples(stamps, wave.measured_sensor, wave.measured_sensor), wave)
+    log = replace(log, clocks={"magnetometer": note})
+    own = [f for f in uneven_stamps(log, None) if f.text.startswith("magnetometer")]
+    assert [finding.code for finding in own] == ["samples_lost"]
+    assert "10.0 %" in own[0].text

@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import LISTED, Finding, Verdict
-from magfusion.receiver.sampling_clock import sampling_clock
+from magfusion.receiver.sampling_clock import lossy_step, sampling_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, IntArray
 
@@ -40,16 +40,17 @@ class Timing(NamedTuple):
     resolution: float = 0.0
 
 
-def timing(stream: str, time: Array, bundled: bool = True) -> Timing | None:
+def timing(stream: str, time: Array, bundled: bool = True, exact: bool = False) -> Timing | None:
     """Return the timing of a stream from its stamps (s); None of fewer than three.
 
-    `bundled`: as in `sampling_clock`.
+    `bundled`: as in `sampling_clock`. `exact`: whether the stamps are known to be no rounded ones.
     """
     if len(time) < 3:
         return None
     clock = sampling_clock(time[:MAX_CLOCKED], bundled)
+    clock = None if exact and clock is not None and clock.resolution else clock
     step = np.diff(time)
-    usual = float(np.median(step)) if clock is None else clock.step
+    usual = lossy_step(time) or float(np.median(step)) if clock is None else clock.step
     gap = np.flatnonzero(step > max(GAP, GAP_STEPS * usual))
     jitter, missing = _uneven(time, step, gap, usual)
     if clock is not None:
@@ -107,7 +108,9 @@ def timings(log: Log, site: Site | None = None) -> tuple[Timing, ...]:
     bundled = site is None or not has_schedule(site)
     result = [timing("imu", log.imu.time, bundled)] if log.inertial else []
     if log.waveform is not None:
-        result.append(timing("magnetometer", log.waveform.time, bundled))
+        clock = log.clocks.get("magnetometer")  # kept stamps have a smaller residual
+        exact = clock is not None and not clock.replaced
+        result.append(timing("magnetometer", log.waveform.time, bundled, exact))
     return tuple(one for one in result if one is not None)
 
 
