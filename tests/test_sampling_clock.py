@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from spoiled_log import burst_stamps
+from spoiled_log import burst_stamps, host_stamps
 
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.batches import spread_batches
 from magfusion.model.samples import ImuSamples, Log, StreamClock, Waveform
+from magfusion.receiver.bursts import spread_bursts
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -254,3 +255,58 @@ def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
     own = [f for f in uneven_stamps(log, None) if f.text.startswith("magnetometer")]
     assert [finding.code for finding in own] == ["samples_lost"]
     assert "10.0 %" in own[0].text
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("rate_hz", "size", "inner", "lateness"),
+    [
+        (160.0, None, (1e-3, 2e-3), (0.05, 0.07)),
+        (99.0, None, (1e-3, 2e-3), (0.05, 0.07)),
+        (400.0, None, (1e-3, 1.5e-3), (0.05, 0.07)),
+        (400.0, None, (8e-4, 9e-4), (0.024, 0.026)),
+        (500.0, 8, (8e-4, 8e-4), (0.0, 3e-3)),
+        (400.0, 8, (1.2e-3, 1.2e-3), (0.0, 3e-3)),
+        (200.0, 4, (1.2e-3, 1.2e-3), (0.0, 3e-3)),
+        (100.0, 5, (2e-3, 2e-3), (0.0, 5e-3)),
+    ],
+)
+def test_bursts_of_samples_that_are_not_much_closer_than_usual_are_counted(
+    rate_hz: float,
+    size: int | None,
+    inner: tuple[float, float],
+    lateness: tuple[float, float],
+    seed: int,
+) -> None:
+    """The steps are of two kinds, and bursts hold as many samples as their distances require."""
+    rng = np.random.default_rng(seed)
+    stamps = host_stamps(4000, rate_hz, rng, inner, lateness, size)
+    for lost in (0.0, 0.5):  # s, of a link that stalls
+        cut = (stamps > 6.0) & (stamps < 6.0 + lost)
+        clock, timed = sampling_clock(stamps[~cut]), timing("imu", stamps[~cut])
+        assert clock is not None
+        assert timed is not None
+        assert timed.rate_hz == pytest.approx(rate_hz, rel=6e-3)
+        assert (timed.lost_share, clock.lost_count) == (0.0, 0)
+        off = clock.time - np.arange(len(stamps))[~cut] / rate_hz
+        before = clock.time < 6.0
+        assert np.std(off[before]) < 0.012  # s; each stall begins a clock again
+        assert np.std(off[~before]) < 0.012
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("scatter", [0.0, 0.05, 0.2])  # of a step
+def test_losses_and_pauses_are_no_bursts(scatter: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tick = np.arange(COUNT)
+    even = STEP * tick + scatter * STEP * rng.uniform(-1.0, 1.0, COUNT)
+    starts = rng.integers(0, COUNT, COUNT // 20)
+    streams = [even, even[tick % 20 < 16], even[tick % 8 < 4]]
+    streams += [even[~np.isin(tick, starts[:, None] + np.arange(size))] for size in (1, 3, 5)]
+    # A multiplexer, and a recorder that stalls for a time without reading.
+    streams += [even + pause * (tick // size) for size, pause in ((10, 0.03), (5, 0.02))]
+    ends = np.cumsum(rng.integers(5, 20, COUNT // 10))
+    stalls = rng.uniform(0.03, 0.09, len(ends) + 1)
+    streams.append(even + np.cumsum(stalls)[np.searchsorted(ends, tick, side="right")])
+    assert [spread_bursts(one) is not None for one in streams] == [False] * len(streams)
+    assert [spread_bursts(one[:200]) is not None for one in streams] == [False] * len(streams)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
-from magfusion.receiver.bursts import LONGEST, MAX_SAMPLES, spread_bursts
+from magfusion.receiver.bursts import LONGEST, spread_bursts
 from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
@@ -25,6 +25,7 @@ MEMORY = 2000  # samples that predict the next ticks
 MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
 MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
+MAX_DELAY = 32  # steps, by which a host delivers late
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
 SHORT = 0.1  # share of the steps; the shortest kind has more
@@ -75,9 +76,11 @@ def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
     breaks = np.flatnonzero(steps >= LONGEST) + 1
     parts = np.split(separate, breaks)
     time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
-    # A lost sample shifts the later ones by a step; a host delivers at most a burst late.
-    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_SAMPLES * step:
+    # A lost sample shifts the later ones by a step.
+    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_DELAY * step:
         time = separate
+    steps = np.diff(time)
+    step = float(np.mean(steps[steps < LONGEST]))
     return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
