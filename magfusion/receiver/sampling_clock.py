@@ -184,7 +184,7 @@ def _may_be_rounded(whole: Array, step: float, resolution: float) -> bool:
     """Return whether steps, whole multiples of the shortest (s), may be of rounded stamps.
 
     Clocks count milliseconds, or other decimal or binary fractions of a second. Rounding to those
-    makes steps of one and two; in a strict period they are rather of a sensor of, say, 100 Hz.
+    makes steps of one and two; in a strict period they are rather of a sensor that loses samples.
     """
     if abs(resolution - step) > EVEN * step:
         return False
