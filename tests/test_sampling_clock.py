@@ -10,6 +10,7 @@ from spoiled_log import burst_stamps, host_stamps
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.batches import spread_batches
 from magfusion.model.samples import ImuSamples, Log, StreamClock, Waveform
+from magfusion.model.trust import Finding
 from magfusion.receiver.bursts import spread_bursts
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.receiver.sampling_clock import sampling_clock
@@ -246,15 +247,23 @@ def test_steps_of_one_and_two_milliseconds_are_of_rounded_stamps(
     assert timed.resolution == pytest.approx(resolution)
 
 
-def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
-    stamps = 1e-3 * np.arange(COUNT)[np.arange(COUNT) % 10 != 9]
+def _kept_stamps(stamps: Array) -> list[Finding]:
+    """Return what is reported of a magnetometer whose stamps fit its tones better than a clock."""
     wave = Waveform(stamps, np.ones((len(stamps), 3)))
-    note = StreamClock(1e-3 / 0.9, 3e-4, 0, replaced=False, resolution=1e-3)
+    note = StreamClock(1e-3, 3e-4, 0, replaced=False, resolution=1e-3)
     log = Log("kept", 0, "", ImuSamples(stamps, wave.measured_sensor, wave.measured_sensor), wave)
     log = replace(log, clocks={"magnetometer": note})
-    own = [f for f in uneven_stamps(log, None) if f.text.startswith("magnetometer")]
+    return [f for f in uneven_stamps(log, None) if f.text.startswith("magnetometer")]
+
+
+def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
+    tick = np.arange(COUNT)
+    own = _kept_stamps(1e-3 * tick[tick % 10 != 9])
     assert [finding.code for finding in own] == ["samples_lost"]
     assert "10.0 %" in own[0].text
+    own = _kept_stamps(2.5e-3 * tick[np.isin(tick % 5, (0, 2))])
+    assert [finding.code for finding in own] == ["stamp_resolution"]
+    assert "The estimators keep them" in own[0].text
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -170,6 +170,8 @@ def lossy_step(stamps: Array) -> float | None:
     resolution is the shortest step (700 Hz in milliseconds).
     """
     steps = np.diff(stamps)
+    if not len(steps) or np.min(steps) <= 0.0:
+        return None
     steps = steps[steps <= GAP * np.median(steps)]
     short = float(np.quantile(steps, SHORT, method="lower"))
     step = float(np.median(steps[steps < 1.5 * short]))
