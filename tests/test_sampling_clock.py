@@ -257,7 +257,7 @@ def _kept_stamps(stamps: Array) -> list[Finding]:
 
 
 def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
-    tick = np.arange(COUNT)
+    tick = np.arange(float(COUNT))
     own = _kept_stamps(1e-3 * tick[tick % 10 != 9])
     assert [finding.code for finding in own] == ["samples_lost"]
     assert "10.0 %" in own[0].text
