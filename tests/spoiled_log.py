@@ -238,3 +238,31 @@ def burst_stamps(count: int, rate_hz: float, rng: np.random.Generator) -> Array:
         bursts.append(now + np.cumsum(rng.uniform(0.001, 0.002, size)))
         now, sent = float(bursts[-1][-1]), sent + size
     return np.concatenate(bursts)
+
+
+def host_stamps(
+    count: int,
+    rate_hz: float,
+    rng: np.random.Generator,
+    inner: tuple[float, float],
+    lateness: tuple[float, float],
+    size: int | None = None,
+) -> Array:
+    """Return stamps (s) of a host that reads `size` samples, or all that are ready, at a time.
+
+    `inner`: time between two samples of a burst (s). `lateness`: of each read (s); without a size
+    the pause between two.
+    """
+    stamps, sent, now = np.empty(count), 0, 0.0
+    while sent < count:
+        if size is None:
+            now += rng.uniform(*lateness)
+            own = max(int(now * rate_hz) - sent, 1)
+        else:
+            own = size
+            now = (sent + own) / rate_hz + rng.uniform(*lateness)
+        own = min(own, count - sent)
+        stamps[sent : sent + own] = now + np.cumsum(rng.uniform(*inner, own)) - inner[0]
+        now = float(stamps[sent + own - 1])
+        sent += own
+    return stamps

@@ -1,4 +1,4 @@
-"""A counter of 32 bits that wraps goes on; a clock that is set does not."""
+"""A counter of 16 or 32 bits that wraps goes on; a clock that is set does not."""
 
 import numpy as np
 import pytest
@@ -26,6 +26,12 @@ def test_a_late_stamp_is_of_before_the_counter_wrapped() -> None:
 def test_a_step_of_a_clock_is_none_of_a_counter(step: float) -> None:
     raw = 1.7e9 + np.array([0.0, 0.01, 0.02 + step, 0.03 + step])
     assert not np.any(lost_by_wrapping(raw, -np.inf, 0.0))
+
+
+def test_milliseconds_of_16_bits_wrap_every_minute() -> None:
+    true = np.arange(62.0, 200.0, 0.005)
+    raw = np.round(true, 3) % 65.536
+    np.testing.assert_allclose(raw + lost_by_wrapping(raw, -np.inf, 0.0), true, rtol=0, atol=1e-9)
 
 
 def test_a_clock_set_back_by_a_period_but_not_from_its_end_is_no_counter() -> None:

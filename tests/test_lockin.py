@@ -555,3 +555,17 @@ def test_hum_is_rejected_though_the_mains_be_a_little_off(frequency_hz, share):
     blind = received(waveform, still_imu(8.0), site, ignored).phasor_sensor - truth
     assert np.max(np.abs(fitted)) < share * hum
     assert np.max(np.abs(blind)) > 10.0 * share * hum
+
+
+@pytest.mark.parametrize("kept", [(0, 1, 2), (0, 1)])
+def test_lines_that_periodic_losses_alias_are_left_out_of_the_design(kept):
+    """Three samples in 10 ms do not separate 50 and 150 Hz, two not even 100 Hz and a constant."""
+    site, rows = noiseless(), np.isin(np.arange(3200) % 4, kept)
+    waveform = simulated(STILL, site, mains=Mains(1e-7 * (kept != (0, 1)), 50.0))
+    cut = Waveform(waveform.time[rows], waveform.measured_sensor[rows])
+    operator = operator_of(cut, still_imu(8.0), site)
+    fields = operator.demodulate(cut.measured_sensor)[0]
+    assert len(fields.time) == 38  # the last one is not filled
+    truth = true_phasors(site, STILL, fields.time)
+    assert worst(fields.phasor_sensor, truth) < 1e-3
+    assert np.max(operator.unexplained(cut.measured_sensor)) < 1e-15  # T^2, of 150 Hz

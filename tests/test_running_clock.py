@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spoiled_log import burst_stamps
+from spoiled_log import burst_stamps, host_stamps
 from test_data_cleaning import walked
 from test_spike_filter import navigated, rms, undisturbed
 
@@ -72,6 +72,27 @@ def test_bursts_are_counted_as_in_a_log(seed: int) -> None:
     # The past is a minute at most: as certain as a log of that length, of stamps 31 ms off.
     assert np.std(off[:1000]) < 0.015  # s
     assert np.std(off[2000:]) < 0.005  # s
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5])  # s
+@pytest.mark.parametrize(
+    ("rate_hz", "size", "lateness"),
+    [(160.0, None, (0.05, 0.07)), (400.0, None, (0.024, 0.026)), (200.0, 4, (0.0, 3e-3))],
+)
+def test_bursts_of_samples_not_much_closer_than_usual_are_counted(
+    rate_hz: float, size: int | None, lateness: tuple[float, float], gap: float
+) -> None:
+    rng = np.random.default_rng(5)
+    inner = (1e-3, 1.3e-3) if size else (8e-4, 1.5e-3)
+    stamps = host_stamps(COUNT, rate_hz, rng, inner, lateness, size)
+    stamps = stamps[(stamps < 8.0) | (stamps >= 8.0 + gap)]
+    whole = sampling_clock(stamps)
+    assert whole is not None
+    time, clock, _ = timed(stamps)
+    assert clock.stamping == "counted"
+    assert 1.0 / clock.step == pytest.approx(rate_hz, rel=2e-3)
+    # Lateness is of a burst; a gap begins a clock again.
+    assert np.std((time - whole.time)[-2000:]) < 0.01  # s
 
 
 @pytest.mark.parametrize("rate_hz", [99.0, 150.0, 300.0, 400.0, 700.0])

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from spoiled_log import burst_stamps
+from spoiled_log import burst_stamps, host_stamps
 
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.batches import spread_batches
-from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.samples import ImuSamples, Log, StreamClock, Waveform
+from magfusion.model.trust import Finding
+from magfusion.receiver.bursts import spread_bursts
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -210,3 +212,110 @@ def test_rounded_stamps_of_batches_are_counted(size: int) -> None:
     assert clock is not None
     off = clock.time[size:] - time[size:]
     assert np.max(np.abs(off - np.median(off))) < 0.05e-3  # s; of the stamps .5 ms
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1e-3, 0.06])  # of a step
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+@pytest.mark.parametrize(
+    ("period", "lost"), [(3, [2]), (4, [3]), (4, [2, 3]), (5, [3, 4]), (8, [7]), (10, [9])]
+)
+def test_periodic_losses_are_no_rounding(
+    period: int, lost: list[int], rate_hz: float, scatter: float
+) -> None:
+    """The steps are whole multiples of the shortest, to which no clock rounds."""
+    row = np.arange(COUNT)
+    selected = row[~np.isin(row % period, lost)] / rate_hz
+    stamps = selected + scatter / rate_hz * np.random.default_rng(4).standard_normal(len(selected))
+    clock, timed = sampling_clock(stamps), timing("imu", stamps)
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    assert timed.lost_share == pytest.approx(len(lost) / period, abs=0.01)
+    assert (clock is None) == (scatter < 0.01)
+    if clock is not None:
+        assert np.max(np.abs(clock.time - selected)) < 0.1 / rate_hz
+
+
+@pytest.mark.parametrize(("rate_hz", "resolution"), [(800.0, 1e-3), (900.0, 1e-3), (61.0, 1e-2)])
+def test_steps_of_one_and_two_milliseconds_are_of_rounded_stamps(
+    rate_hz: float, resolution: float
+) -> None:
+    stamps = resolution * np.rint(np.arange(COUNT) / rate_hz / resolution)
+    timed = timing("imu", stamps)
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    assert timed.lost_share == 0.0
+    assert timed.resolution == pytest.approx(resolution)
+
+
+def _kept_stamps(stamps: Array) -> list[Finding]:
+    """Return what is reported of a magnetometer whose stamps fit its tones better than a clock."""
+    wave = Waveform(stamps, np.ones((len(stamps), 3)))
+    note = StreamClock(1e-3, 3e-4, 0, replaced=False, resolution=1e-3)
+    log = Log("kept", 0, "", ImuSamples(stamps, wave.measured_sensor, wave.measured_sensor), wave)
+    log = replace(log, clocks={"magnetometer": note})
+    return [f for f in uneven_stamps(log, None) if f.text.startswith("magnetometer")]
+
+
+def test_stamps_that_the_tones_confirm_are_not_reported_as_rounded() -> None:
+    tick = np.arange(float(COUNT))
+    own = _kept_stamps(1e-3 * tick[tick % 10 != 9])
+    assert [finding.code for finding in own] == ["samples_lost"]
+    assert "10.0 %" in own[0].text
+    own = _kept_stamps(2.5e-3 * tick[np.isin(tick % 5, (0, 2))])
+    assert [finding.code for finding in own] == ["stamp_resolution"]
+    assert "The estimators keep them" in own[0].text
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("rate_hz", "size", "inner", "lateness"),
+    [
+        (160.0, None, (1e-3, 2e-3), (0.05, 0.07)),
+        (99.0, None, (1e-3, 2e-3), (0.05, 0.07)),
+        (400.0, None, (1e-3, 1.5e-3), (0.05, 0.07)),
+        (400.0, None, (8e-4, 9e-4), (0.024, 0.026)),
+        (500.0, 8, (8e-4, 8e-4), (0.0, 3e-3)),
+        (400.0, 8, (1.2e-3, 1.2e-3), (0.0, 3e-3)),
+        (200.0, 4, (1.2e-3, 1.2e-3), (0.0, 3e-3)),
+        (100.0, 5, (2e-3, 2e-3), (0.0, 5e-3)),
+    ],
+)
+def test_bursts_of_samples_that_are_not_much_closer_than_usual_are_counted(
+    rate_hz: float,
+    size: int | None,
+    inner: tuple[float, float],
+    lateness: tuple[float, float],
+    seed: int,
+) -> None:
+    """The steps are of two kinds, and bursts hold as many samples as their distances require."""
+    rng = np.random.default_rng(seed)
+    stamps = host_stamps(4000, rate_hz, rng, inner, lateness, size)
+    for lost in (0.0, 0.5):  # s, of a link that stalls
+        cut = (stamps > 6.0) & (stamps < 6.0 + lost)
+        clock, timed = sampling_clock(stamps[~cut]), timing("imu", stamps[~cut])
+        assert clock is not None
+        assert timed is not None
+        assert timed.rate_hz == pytest.approx(rate_hz, rel=6e-3)
+        assert (timed.lost_share, clock.lost_count) == (0.0, 0)
+        off = clock.time - np.arange(len(stamps))[~cut] / rate_hz
+        before = clock.time < 6.0
+        assert np.std(off[before]) < 0.012  # s; each stall begins a clock again
+        assert np.std(off[~before]) < 0.012
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("scatter", [0.0, 0.05, 0.2])  # of a step
+def test_losses_and_pauses_are_no_bursts(scatter: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tick = np.arange(COUNT)
+    even = STEP * tick + scatter * STEP * rng.uniform(-1.0, 1.0, COUNT)
+    starts = rng.integers(0, COUNT, COUNT // 20)
+    streams = [even, even[tick % 20 < 16], even[tick % 8 < 4]]
+    streams += [even[~np.isin(tick, starts[:, None] + np.arange(size))] for size in (1, 3, 5)]
+    # A multiplexer, and a recorder that stalls for a time without reading.
+    streams += [even + pause * (tick // size) for size, pause in ((10, 0.03), (5, 0.02))]
+    ends = np.cumsum(rng.integers(5, 20, COUNT // 10))
+    stalls = rng.uniform(0.03, 0.09, len(ends) + 1)
+    streams.append(even + np.cumsum(stalls)[np.searchsorted(ends, tick, side="right")])
+    assert [spread_bursts(one) is not None for one in streams] == [False] * len(streams)
+    assert [spread_bursts(one[:200]) is not None for one in streams] == [False] * len(streams)

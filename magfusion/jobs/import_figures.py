@@ -63,7 +63,7 @@ def import_figures(
     notes += filter(None, remarks)
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     notes += [
-        f"{stream}: its times wrap as a counter of 32 bits does; they go on by"
+        f"{stream}: its times wrap as a counter of 16 or 32 bits does; they go on by"
         f" {one.wrapped * NANOSECOND:.6g} s."
         for stream, one in counts.items()
         if one.wrapped

@@ -1,4 +1,4 @@
-"""Clocks of the records in a pipe: counters of 32 bits are unwrapped, steps are found."""
+"""Clocks of the records in a pipe: counters are unwrapped, steps are found."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -81,7 +81,7 @@ class StreamClocks:
             yield one if one.record is None else replace(one, record=self.unwrapped(one.record))
 
     def unwrapped(self, record: Record) -> Record:
-        """Return a record whose stamps go on where a counter of 32 bits began again."""
+        """Return a record whose stamps go on where a counter began again."""
         changed = {}
         for kind in type(record).model_fields:
             part = getattr(record, kind)

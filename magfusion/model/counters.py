@@ -1,10 +1,11 @@
-"""Counters of 32 bits as clocks: where they wrap, the stamps go on."""
+"""Counters of 32 bits, or 16 bits of milliseconds, as clocks: where they wrap, the stamps go on."""
 
 import numpy as np
 
 from magfusion.units import Array
 
-PERIODS = (2.0**32 * 1e-9, 2.0**32 * 1e-6, 2.0**32 * 1e-3)  # s; of nanoseconds and coarser units
+# s; of 32 bits of nanoseconds and coarser units, and of 16 bits of milliseconds
+PERIODS = (2.0**32 * 1e-9, 2.0**32 * 1e-6, 2.0**32 * 1e-3, 2.0**16 * 1e-3)
 NEAR_END, NEAR_SHARE = 1.0, 0.05  # s, of a period, at most; before and after it wraps
 
 

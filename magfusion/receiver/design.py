@@ -20,6 +20,7 @@ LARGEST = 2**28  # bytes of the maps of one chunk; many tones in long windows sh
 KEPT = 256 * 2**20  # bytes of cached maps; others are recomputed
 EVEN_KEPT = 64  # maps of evenly spaced samples
 MIN_SHARED_WINDOWS = 4  # windows for each of their spacings
+GAP = 1.5  # times the shortest step of a window; a longer one misses samples
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, its columns are not separable
 
 
@@ -80,10 +81,17 @@ class Designs:
         return sum(map(_size, self.kept.values()))
 
     def design(self, elapsed: Array, weight: BoolArray) -> Array:
-        """Return the columns fitted to windows, shape (n, m, columns)."""
+        """Return the columns for windows, shape (n, m, columns)."""
         result = design_of(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
         result *= weight[..., None]
         return result
+
+    def separated_design(self, elapsed: Array, weight: BoolArray) -> tuple[Array, Array]:
+        """Return the columns fitted to windows, and their normal matrices; see `drop_lines`."""
+        design = self.design(elapsed, weight)
+        normal = np.swapaxes(design, -1, -2) @ design
+        drop_lines(design, normal, elapsed, weight, len(self.frequencies_hz), len(self.nuisance_hz))
+        return design, normal
 
     def _maps(self, windows: Windows) -> tuple[Maps, bool]:
         """Return the maps of some windows, and whether most were computed for them alone."""
@@ -127,9 +135,9 @@ class Designs:
         return new
 
     def _build(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
-        design, n = self.design(elapsed, weight), len(self.frequencies_hz)
-        projected = np.swapaxes(design, -1, -2)
-        inverse = np.asarray(np.linalg.inv(projected @ design))
+        design, normal = self.separated_design(elapsed, weight)
+        n, projected = len(self.frequencies_hz), np.swapaxes(design, -1, -2)
+        inverse = np.asarray(np.linalg.inv(normal))
         dimensions = np.r_[0, 2 : 2 + 2 * n]
         extra_lines_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
         probes = probes_left(self.frequencies_hz, extra_lines_hz, elapsed, weight, design, inverse)
@@ -258,11 +266,12 @@ def variance_growth(
     """
     nuisance_hz = nuisances_hz(settings, frequencies_hz, 0.5 / step)
 
+    tones, lines = len(frequencies_hz), len(nuisance_hz)
+
     def variance(elapsed: Array, weight: BoolArray) -> Array:
         design = design_of(elapsed, settings, frequencies_hz, nuisance_hz) * weight[..., None]
         normal = np.swapaxes(design, -1, -2) @ design
-        good = np.linalg.cond(normal) < WORST_CONDITION
-        normal[~good] = np.eye(normal.shape[-1])
+        good = drop_lines(design, normal, elapsed, weight, tones, lines)
         own = np.diagonal(np.linalg.inv(normal), axis1=-2, axis2=-1)
         return np.where(good[:, None], own[:, 2 : 2 + 2 * len(frequencies_hz)], np.inf)
 
@@ -272,6 +281,40 @@ def variance_growth(
         _, weight, elapsed = padded(windows.rows(slice(begin, begin + CHUNK)), time)
         out.append(np.max(variance(elapsed, weight) / usual, axis=1))
     return np.concatenate(out)
+
+
+def drop_lines(
+    design: Array, normal: Array, elapsed: Array, weight: BoolArray, tones: int, lines: int
+) -> BoolArray:
+    """Drop, in place, the mains lines that windows with missing samples do not separate.
+
+    Samples lost in a pattern alias lines below the Nyquist frequency of the others. A dropped
+    column is zero, with one on the diagonal of its normal matrix. Lines are kept from the lowest
+    on. Returns (n,): whether the remaining columns are separable; if not, `normal` is the identity.
+    """
+    step = np.where(weight[:, 1:], np.diff(elapsed, axis=1), 0.0)
+    shortest = np.min(np.where(weight[:, 1:], step, np.inf), axis=1, initial=np.inf)
+    good = np.max(step, axis=1, initial=0.0) < GAP * shortest  # of a stream without losses
+    good[~good] = np.linalg.cond(normal[~good]) < WORST_CONDITION
+    corrupted = np.flatnonzero(~good)
+    if not len(corrupted):
+        return good
+    kept = np.ones((len(corrupted), normal.shape[-1]), dtype=bool)
+    of_lines = 2 + 4 * tones + np.arange(2 * lines).reshape(2, lines)
+    kept[:, of_lines] = False
+
+    def reduced() -> Array:
+        both = kept[:, :, None] & kept[:, None]
+        return np.where(both, normal[corrupted], np.eye(normal.shape[-1]))
+
+    for line in of_lines.T:
+        kept[:, line] = True
+        kept[np.ix_(np.linalg.cond(reduced()) >= WORST_CONDITION, line)] = False
+    good[corrupted] = separable = np.linalg.cond(reduced()) < WORST_CONDITION
+    kept[~separable] = False
+    normal[corrupted] = reduced()
+    design[corrupted] *= kept[:, None]
+    return good
 
 
 def design_of(

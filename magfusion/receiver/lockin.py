@@ -140,9 +140,9 @@ class WindowOperator:
         """Return the residual power of each window, shape (n,) (T^2)."""
         still, out = self._still(measured_sensor), []
         for _, maps in self.designs.pieces():
-            design = self.designs.design(maps.elapsed, maps.weight)
+            design, normal = self.designs.separated_design(maps.elapsed, maps.weight)
             field, projected = _of_windows(still, maps), np.swapaxes(design, -1, -2)
-            fitted = np.linalg.solve(projected @ design, projected @ field)
+            fitted = np.linalg.solve(normal, projected @ field)
             residual = field - design @ fitted
             out.append(np.sum(residual**2, axis=(1, 2)) / np.sum(maps.weight, axis=1))
         return np.concatenate(out)

@@ -8,7 +8,14 @@ from typing import Literal
 import numpy as np
 
 from magfusion.model.batches import PAUSE, spread_batches
-from magfusion.receiver.bursts import LONGEST, SHARE, TOGETHER, spread_bursts
+from magfusion.receiver.bursts import (
+    LONGEST,
+    SHARE,
+    TOGETHER,
+    burst_ends,
+    burst_limit,
+    shortest_pause,
+)
 from magfusion.receiver.sampling_clock import (
     GAP,
     is_even,
@@ -49,6 +56,7 @@ class RunningClock:
         self._origin, self._pause, self._fitted = 0.0, np.inf, -np.inf
         self._points, self._width = np.empty((2, 0)), 0
         self._scatter, self._rounding = 0.0, 0.0
+        self._limit: float | None = None  # s; samples of a burst are closer
         # Even stamps that may turn out to be rounded, and how many come before a check.
         self._watched: Array | None = None
         self._until_check = 0
@@ -102,11 +110,10 @@ class RunningClock:
             if np.mean(copies[together]) > 0.5 or len(last) < MIN_POINTS:
                 return stamps, rows
             return self._start("counted", stamps, spread_batches(stamps, last), last), rows
-        separate = spread_bursts(stamps)
-        if separate is not None:
-            far = np.diff(stamps) > TOGETHER * float(np.mean(np.diff(stamps)))
-            last = np.append(np.flatnonzero(far), len(stamps) - 1)
-            return self._start("counted", stamps, separate, last), rows
+        self._limit = burst_limit(stamps)
+        if self._limit is not None:
+            last = burst_ends(stamps, self._limit)
+            return self._start("counted", stamps, spread_batches(stamps, last), last), rows
         clock = sampling_clock(stamps)
         self._rounding = stamp_resolution(stamps)
         if clock is None or not self._rounding or clock.scatter > CLEAR * clock.step:
@@ -169,7 +176,7 @@ class RunningClock:
         before = np.append(self._stamp, stamps)
         if self.stamping == "counted":
             tick = self._tick + np.arange(float(len(before)))
-            ends = np.flatnonzero(np.diff(before) > TOGETHER * self.step)
+            ends = np.flatnonzero(np.diff(before) > (self._limit or TOGETHER * self.step))
             points = np.stack([tick[ends], before[ends]])
             self._points = np.hstack([self._points, points])
         else:
@@ -215,7 +222,7 @@ def _is_candidate(stamps: Array) -> bool:
     steps = np.diff(stamps)
     if (steps < 0.0).any():
         return False
-    together: BoolArray = steps <= TOGETHER * float(np.mean(steps))
+    together: BoolArray = steps <= shortest_pause(steps)
     if np.mean(together) > 0.5 * SHARE:
         return True
     distinct = stamps[np.append(True, steps > 0.0)]

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
-from magfusion.receiver.bursts import LONGEST, MAX_SAMPLES, spread_bursts
+from magfusion.receiver.bursts import LONGEST, spread_bursts
 from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
 MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks are not separable
 PIECE = 200  # samples assigned to ticks at once
 KEPT = 150  # of them: those at the end may belong to another tick
-MOST_LOST = 40  # ticks in a piece; a longer silence is a gap
+MOST_LOST = 40  # ticks in a piece, unless more are seen to be; a longer silence is a gap
 GAP = 10.0  # steps
 LOSS = 8.0  # log-likelihood ratio that a lost sample costs, where few are lost
 MANY_LOST = 0.05  # of the samples; beyond, a loss costs what this share of losses does
@@ -25,8 +25,13 @@ MEMORY = 2000  # samples that predict the next ticks
 MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
 MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
+MAX_DELAY = 32  # steps, by which a host delivers late
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
+SHORT = 0.1  # share of the steps; the shortest kind has more
+LATTICE = 0.1  # of a step, root mean square; of steps at random it is 0.29
+STRICT = 0.98  # share of equal periods
+MILLISECONDS = (1e-3, 2.0**-10)  # s, in which most coarse clocks count
 ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
 MAX_ROUNDING_STEPS = 1.2  # resolutions; rounding is half of one, cutting off one
 MOST_STEPS = 10_000  # of which a common divisor is looked for
@@ -71,9 +76,11 @@ def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
     breaks = np.flatnonzero(steps >= LONGEST) + 1
     parts = np.split(separate, breaks)
     time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
-    # A lost sample shifts the later ones by a step; a host delivers at most a burst late.
-    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_SAMPLES * step:
+    # A lost sample shifts the later ones by a step.
+    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_DELAY * step:
         time = separate
+    steps = np.diff(time)
+    step = float(np.mean(steps[steps < LONGEST]))
     return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
@@ -98,12 +105,14 @@ def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
     """Return the clock of stamps with a scatter due to rounding (s, root mean square)."""
     if len(stamps) < PIECE:
         return None
-    counted, median = _counted_step(stamps), float(np.median(np.diff(stamps)))
+    lossy = lossy_step(stamps)
+    counted = None if lossy else _counted_step(stamps)
+    median = lossy or float(np.median(np.diff(stamps)))
     # Rounded steps are equal for a while, if they are nearly a whole number of resolutions.
     rounded = EVEN * median < rounding < MOST_ROUNDING * median
     if counted is None and not rounded and is_even(stamps, median):
         return None
-    step = counted or _usual_step(stamps)
+    step = counted or _usual_step(stamps, median)
     if not rounded and is_even(stamps, step):
         return None
     whole = np.diff(stamps) / step
@@ -154,14 +163,52 @@ def _counted_step(stamps: Array) -> float | None:
     return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * rounding else None
 
 
-def _usual_step(stamps: Array) -> float:
+def lossy_step(stamps: Array) -> float | None:
+    """Return the step (s) of an even clock that misses many samples; None if stamps show none.
+
+    The steps are whole multiples of the shortest kind. So are those of rounded stamps, where the
+    resolution is the shortest step (700 Hz in milliseconds).
+    """
+    steps = np.diff(stamps)
+    if not len(steps) or np.min(steps) <= 0.0:
+        return None
+    steps = steps[steps <= GAP * np.median(steps)]
+    short = float(np.quantile(steps, SHORT, method="lower"))
+    step = float(np.median(steps[steps < 1.5 * short]))
+    whole = np.rint(steps / step)
+    share, off = float(np.mean(whole)) - 1.0, steps / step - whole
+    if share < ROUNDED or np.std(off) > LATTICE or abs(np.mean(off)) > EVEN * (1.0 + share):
+        return None
+    return None if _may_be_rounded(whole, step, stamp_resolution(stamps)) else step
+
+
+def _may_be_rounded(whole: Array, step: float, resolution: float) -> bool:
+    """Return whether steps, whole multiples of the shortest (s), may be of rounded stamps.
+
+    Clocks count milliseconds, or other decimal or binary fractions of a second. Rounding to those
+    makes steps of one and two; in a strict period they are rather of a sensor that loses samples.
+    """
+    if abs(resolution - step) > EVEN * step:
+        return False
+    if min(abs(resolution - unit) for unit in MILLISECONDS) < EVEN * resolution:
+        return True
+    if np.max(whole) > 2.0:
+        return False
+    powers = np.log10(resolution), np.log2(resolution)
+    if min(abs(power - np.rint(power)) for power in powers) > 1e-5:
+        return False
+    period = np.diff(np.flatnonzero(whole == 2.0))
+    return bool(np.mean(period == np.median(period)) < STRICT)
+
+
+def _usual_step(stamps: Array, median: float) -> float:
     """Return the time between two ticks (s): the period that fits the stamps of each piece best.
 
     By the length of the mean phasor (Rayleigh's test), which is insensitive to lost samples.  The
     median step is not that of rounded stamps, and the mean not that where samples are lost.
+    `median`: of the steps without losses (s).
     """
     steps = np.diff(stamps)
-    median = float(np.median(steps))
     mean = float(np.mean(steps[steps <= GAP * median]))
     count = len(stamps) // PIECE
     pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MOST_PIECES]
@@ -227,7 +274,7 @@ def lost_ticks(late: Array, sigma: float) -> IntArray:
     """
     if np.max(np.abs(late)) < 0.5:
         return np.zeros(len(late), dtype=np.int64)
-    lost_epochs = np.arange(MOST_LOST + 1)
+    lost_epochs = np.arange(max(MOST_LOST, int(np.max(late)) + 2) + 1)
     loss = -np.log(MANY_LOST) if late[-1] > MANY_LOST * len(late) else LOSS
     cost = np.where(lost_epochs == 0, 0.0, loss)
     came = np.zeros((len(late), len(lost_epochs)), dtype=np.int64)

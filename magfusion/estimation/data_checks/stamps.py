@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import LISTED, Finding, Verdict
-from magfusion.receiver.sampling_clock import sampling_clock
+from magfusion.receiver.sampling_clock import lossy_step, sampling_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, IntArray
 
@@ -40,16 +40,19 @@ class Timing(NamedTuple):
     resolution: float = 0.0
 
 
-def timing(stream: str, time: Array, bundled: bool = True) -> Timing | None:
+def timing(stream: str, time: Array, bundled: bool = True, exact: bool = False) -> Timing | None:
     """Return the timing of a stream from its stamps (s); None of fewer than three.
 
-    `bundled`: as in `sampling_clock`.
+    `bundled`: as in `sampling_clock`. `exact`: whether fields fit the stamps better than a clock:
+    then steps of one and two resolutions are of lost samples.
     """
     if len(time) < 3:
         return None
     clock = sampling_clock(time[:MAX_CLOCKED], bundled)
+    if exact and clock is not None and clock.resolution > 0.5 * clock.step:
+        clock = None
     step = np.diff(time)
-    usual = float(np.median(step)) if clock is None else clock.step
+    usual = lossy_step(time) or float(np.median(step)) if clock is None else clock.step
     gap = np.flatnonzero(step > max(GAP, GAP_STEPS * usual))
     jitter, missing = _uneven(time, step, gap, usual)
     if clock is not None:
@@ -107,7 +110,9 @@ def timings(log: Log, site: Site | None = None) -> tuple[Timing, ...]:
     bundled = site is None or not has_schedule(site)
     result = [timing("imu", log.imu.time, bundled)] if log.inertial else []
     if log.waveform is not None:
-        result.append(timing("magnetometer", log.waveform.time, bundled))
+        clock = log.clocks.get("magnetometer")  # kept stamps have a smaller residual
+        exact = clock is not None and not clock.replaced
+        result.append(timing("magnetometer", log.waveform.time, bundled, exact))
     return tuple(one for one in result if one is not None)
 
 
@@ -117,7 +122,9 @@ def uneven_stamps(log: Log, site: Site | None) -> Iterator[Finding]:
     paused = any(f.code == "repeated_samples" for f in log.noticed)
     for one in result:
         explained = {"samples_lost"} if paused and one.stream == "magnetometer" else set()
-        yield from (f for f in _of_one(one) if f.code not in explained)
+        clock = log.clocks.get(one.stream)
+        findings = _of_one(one, clock is not None and not clock.replaced)
+        yield from (f for f in findings if f.code not in explained)
     for stream, clock in log.clocks.items():
         if clock.replaced and clock.resolution:
             yield _rounded(stream, clock.resolution, clock.step)
@@ -134,7 +141,7 @@ def uneven_stamps(log: Log, site: Site | None) -> Iterator[Finding]:
         yield from _overlap_findings(*result)
 
 
-def _of_one(one: Timing) -> Iterator[Finding]:
+def _of_one(one: Timing, kept: bool = False) -> Iterator[Finding]:
     usual, span = 1.0 / one.rate_hz, max(one.end - one.begin, 1e-9)
     if len(one.gap_begin):
         length = one.gap_end - one.gap_begin
@@ -159,7 +166,7 @@ def _of_one(one: Timing) -> Iterator[Finding]:
             weight=one.lost_share / MAX_LOST_SHARE,
         )
     if one.jitter > JITTER * usual and one.resolution:
-        yield _rounded(one.stream, one.resolution, usual)
+        yield _rounded(one.stream, one.resolution, usual, kept)
     elif one.jitter > JITTER * usual:
         yield Finding(
             "jitter",
@@ -171,11 +178,14 @@ def _of_one(one: Timing) -> Iterator[Finding]:
         )
 
 
-def _rounded(stream: str, resolution: float, step: float) -> Finding:
+def _rounded(stream: str, resolution: float, step: float, kept: bool = False) -> Finding:
+    use = "keep them: the fields fit them better than" if kept else "use"
+    clock = f"an even clock of {1.0 / step:.4g} Hz" + ("" if kept else " instead")
     return Finding(
         "stamp_resolution",
-        f"{stream}: the stamps are rounded to {1e3 * resolution:.4g} ms. The estimators use an even"
-        f" clock of {1.0 / step:.4g} Hz instead. Stamp the samples in nanoseconds.",
+        f"{stream}: the stamps are {'multiples of' if kept else 'rounded to'}"
+        f" {1e3 * resolution:.4g} ms. The estimators {use} {clock}."
+        " Stamp the samples in nanoseconds.",
         Verdict.TRUSTWORTHY,
         resolution / step,
     )

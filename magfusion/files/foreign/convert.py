@@ -254,7 +254,7 @@ def _is_rotation(values: Array, places: list[int], rows: BoolArray, counts: Coun
 
 
 def _unwrapped(stamps: IntArray, rows: BoolArray, counts: Counts) -> IntArray:
-    """Return stamps (ns) that go on where a counter of 32 bits wraps; some rows have none."""
+    """Return stamps (ns) that go on where a counter wraps; some rows have none."""
     if not rows.any():
         return stamps
     seconds: Array = np.asarray(stamps[rows] * NANOSECOND)
