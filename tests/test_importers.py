@@ -248,7 +248,7 @@ def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
         ("imu0", "#t,a,b,c,d,e,f\n1,2,3,4,5,6,7\n,2,3,4,5,6,7\n", "row 1 .*found no value"),
         ("mag0", f"#t,a,b,c\n{START_NS},2e4,3e3,4e4\n", "divide nanotesla by 1e9"),
         ("mag0", f"#t\n{START_NS}\n", "columns field_x, field_y, field_z are missing"),
-        ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,0,0,0,0\n", "found 0.0"),
+        ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,2,0,0,0\n", "found 2.0"),
     ],
 )
 def test_a_bad_euroc_folder_is_refused(
@@ -385,8 +385,8 @@ def _spoil(part: str, name: str, value: float) -> Callable[[Any], object]:
             "topic /imu: angular_velocity is marked as not measured",
         ),
         (
-            SENSORS | {"/mocap": (POSE, _changed(pose_message, lambda m: _no_turn(m.pose)))},
-            f"topic /mocap: the message stamped {STAMPS[7]} ns has a quaternion of length 0",
+            SENSORS | {"/mocap": (POSE, lambda k: _twice_as_long(pose_message(k)))},
+            f"topic /mocap: the message stamped {STAMPS[0]} ns has a quaternion of length 2",
         ),
         (
             SENSORS | {"/imu/mag": (FIELD, lambda k: _scaled_field(k, 1e4))},
@@ -426,6 +426,12 @@ def test_samples_that_were_not_taken_are_left_out_of_a_bag_and_said(tmp_path: Pa
         "missing_samples: truth: 1 samples are NaN. They are left out.",
     ]
     assert not open_log(bag, 0.11).noticed
+    untracked = _changed(pose_message, lambda message: _no_turn(message.pose))
+    log = open_log(write_bag(tmp_path / "zeros", SENSORS | {"/mocap": (POSE, untracked)}))
+    assert log.truth is not None
+    assert len(log.truth) == len(POSITION) - 1
+    text = f"truth: left out 1 of {len(POSITION)} rows: 1 with a quaternion of zeros."
+    assert [finding.text for finding in log.noticed] == [text]
 
 
 def _stamped(message: Any, k: int) -> Any:
@@ -435,6 +441,12 @@ def _stamped(message: Any, k: int) -> Any:
 
 def _no_turn(pose: Any) -> None:
     pose.orientation = xyz("Quaternion", np.zeros(4))
+
+
+def _twice_as_long(message: Any) -> Any:
+    for axis in "wxyz":
+        setattr(message.pose.orientation, axis, 2.0 * getattr(message.pose.orientation, axis))
+    return message
 
 
 def _scaled_field(k: int, factor: float) -> Any:

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -104,6 +105,9 @@ def read_log(
         waveform = replace(waveform, marks=marks)
     if marks is not None:
         waveforms = {name: replace(wave, marks=marks) for name, wave in waveforms.items()}
+    of_truth: list[Finding] = []
+    read_truth = partial(_read_truth, noticed=of_truth)
+    truth = read_if_there(tables["truth"], read_truth, span)
     log = Log(
         name=header.name,
         epoch_ns=header.epoch_ns,
@@ -111,8 +115,8 @@ def read_log(
         imu=imu,
         waveform=waveform,
         fields=read_if_there(tables["fields"], read_fields, span),
-        truth=read_if_there(tables["truth"], _read_truth, span),
-        noticed=(*of_imu, *of_waveform, *lost_finding(header.audio)),
+        truth=truth,
+        noticed=(*of_imu, *of_waveform, *of_truth, *lost_finding(header.audio)),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
         reference=read_waveform(tables["reference"], span)[0],
@@ -180,5 +184,5 @@ def _keep_others(former: Path, directory: Path) -> None:
             shutil.copy2(entry, directory / entry.name)
 
 
-def _read_truth(path: Path, span: Span) -> Trajectory:
-    return read_trajectory(path, span.epoch_ns, span.start, span.end)
+def _read_truth(path: Path, span: Span, noticed: list[Finding]) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end, noticed=noticed)

@@ -11,14 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.pose_rows import PoseRows
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
-from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
 from magfusion.units import NS_PER_S
 
 _COLUMNS = "time_s x y z qx qy qz qw"
 _POSITIONS = "time_s x y z"
-_EIGHT = f"eight finite numbers: {_COLUMNS}"
+_EIGHT = f"eight numbers: {_COLUMNS}"
 
 
 def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
@@ -36,12 +37,13 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
             stream.write(" ".join([time, *(f"{value:.9f}" for value in pose)]) + "\n")
 
 
-def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
+def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
     Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
-    not text, empty, a line does not hold eight finite numbers (or four, of positions alone: as many
-    as the first line), a quaternion is not of unit length, or the times do not increase.
+    not text, empty, a line does not hold eight numbers (or four, of positions alone: as many as the
+    first line), no line or too few a pose, or the times do not increase. `noticed`: receives the
+    number of lines without a pose, which are left out.
     """
     lines = _lines(path)
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
@@ -50,13 +52,19 @@ def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
     time = Span(epoch_ns).seconds(stamps)
     for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
         _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")
-    if count == 4:
-        return Trajectory(time, np.full((len(time), 3, 3), np.nan), values)
-    length = np.linalg.norm(values[:, 3:], axis=1)
-    for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
-        _refuse(path, lines[k][0], f"a quaternion of length {length[k]:.6g}", "one of length 1")
-    rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
-    return Trajectory(time, rotation, values[:, :3])
+    poses = PoseRows.of(values[:, :3], None if count == 4 else values[:, 3:])
+    for k in np.flatnonzero(poses.refused)[:1]:
+        result = f"a quaternion of length {poses.length[k]:.6g}"
+        _refuse(path, lines[k][0], result, "one of length 1")
+    if not poses.kept.any():
+        raise InputError(f"{path}: none of its {len(lines)} lines has a pose; record it again.")
+    if noticed is not None:
+        noticed += poses.findings(path.name)
+    time, position = time[poses.kept], values[poses.kept, :3]
+    if poses.quaternion is None:
+        return Trajectory(time, np.full((len(time), 3, 3), np.nan), position)
+    rotation = Rotation.from_quat(poses.quaternion[poses.kept]).as_matrix()
+    return Trajectory(time, rotation, position)
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -74,15 +82,15 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
-    """Return position and quaternion."""
+    """Return position and quaternion; NaN for what is not finite."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not (np.abs(values) < LARGEST_NUMBER).all():
-        wanted = f"four finite numbers: {_POSITIONS}" if count == 4 else _EIGHT
+    if len(values) != count or not abs(values[0]) < LARGEST_NUMBER:
+        wanted = f"four numbers: {_POSITIONS}" if count == 4 else _EIGHT
         _refuse(path, number, repr(text[:60]), wanted)
-    return values[1:]
+    return [value if abs(value) < LARGEST_NUMBER else np.nan for value in values[1:]]
 
 
 def _stamp(path: Path, number: int, text: str) -> int:

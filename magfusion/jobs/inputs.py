@@ -274,12 +274,17 @@ def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
     return poses
 
 
-def read_any_poses(path: Path, epoch_ns: int = 0) -> Trajectory:
-    """Read a trajectory as `read_estimate`, which may have positions or attitudes alone."""
+def read_any_poses(
+    path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
+) -> Trajectory:
+    """Read a trajectory as `read_estimate`, which may have positions or attitudes alone.
+
+    `noticed`: receives the number of rows without a pose, which are left out.
+    """
     if path.is_dir():
         if not (path / "trajectory.parquet").is_file():
             raise InputError(f"{path}: has no trajectory.parquet; give the result of a job")
         return read_trajectory(path / "trajectory.parquet", epoch_ns)
     if path.suffix in (".parquet", ".csv"):
-        return read_trajectory(path, epoch_ns)
-    return read_tum(path, epoch_ns)
+        return read_trajectory(path, epoch_ns, noticed=noticed)
+    return read_tum(path, epoch_ns, noticed)

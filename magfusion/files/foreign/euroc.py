@@ -75,7 +75,7 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         source="EuRoC folder",
         imu=samples,
         waveform=waveform,
-        truth=_truth(tables.get("truth"), span),
+        truth=_truth(tables.get("truth"), span, noticed),
         noticed=(*noticed, *of_imu, *of_waveform),
     )
 
@@ -172,8 +172,8 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     return (Finding("stamp_resolution", text, _REMARK),)
 
 
-def _truth(table: _StreamTable | None, span: Span) -> Trajectory | None:
+def _truth(table: _StreamTable | None, span: Span, noticed: list[Finding]) -> Trajectory | None:
     if table is None:
         return None
-    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content)
+    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, noticed)
     return truth if len(truth) else None
