@@ -265,6 +265,33 @@ def test_amplitudes_of_three_axes_are_no_parts_in_phase(
         refuse_unsigned(fields, np.full(2, 20.0), "log")
 
 
+def test_a_tum_truth_in_milliseconds_is_read_and_other_times_beyond_a_clock_are_named(
+    tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    start = 1_700_000_000_000
+    stamped = [[f"{start + t:.0f}", *row] for t, row in zip(TIME, rows_of(RATES), strict=True)]
+    write(
+        tables / "imu.csv",
+        IMU_HEAD,
+        [[*a[:4], *b] for a, b in zip(stamped, rows_of(FORCES), strict=True)],
+    )
+    write(
+        tables / "mag.csv",
+        FIELD_HEAD,
+        [[a[0], *b] for a, b in zip(stamped, rows_of(FIELDS), strict=True)],
+    )
+    poses = [f"{start + 100 * k} 0 0 {k} 0 0 0 1" for k in range(15)]
+    (tables / "t.tum").write_text("\n".join(poses) + "\n")
+    write(tables / "t.csv", "t_s,px_m,py_m,pz_m", [row.split()[:4] for row in poses])
+    text = reported(capfd, f"{BOTH} --truth t.csv")
+    assert "beyond any clock in s: give their unit by --map 'truth.time=NAME[ns]'" in text
+    run_command("import", *BOTH.split(), "--truth", "t.tum", "-o", "log")
+    assert "truth.time=0[ms]" in capfd.readouterr().out
+    truth = read_log(Path("log")).truth
+    assert truth is not None
+    assert len(truth) == 15
+
+
 def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:
     sentence = refuse("import", tables / "nowhere.csv", "-o", tables / "log")
     assert "give the path of a source" in sentence

@@ -109,6 +109,18 @@ def test_lines_without_a_pose_are_left_out_and_counted(tmp_path: Path, lost: str
     assert noticed[0].text.startswith("t.tum: left out 1 of 12 rows: 1 with")
 
 
+@pytest.mark.parametrize(("unit", "zeros"), [("ms", 3), ("us", 6), ("ns", 9)])
+def test_dates_in_smaller_units_are_read_and_reported(
+    tmp_path: Path, unit: str, zeros: int
+) -> None:
+    lines = [f"{(1_700_000_000 + k) * 10**zeros} {GOOD[4:]}" for k in range(3)]
+    (tmp_path / "t.tum").write_text("\n".join(lines))
+    noticed: list[Finding] = []
+    result = read_tum(tmp_path / "t.tum", 1_700_000_000 * 10**9, noticed)
+    np.testing.assert_array_equal(result.time, [0.0, 1.0, 2.0])
+    assert f"t.tum: its times are read as {unit}" in noticed[0].text
+
+
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match=r"t\.tum: cannot be read as text"):

@@ -14,9 +14,12 @@ from magfusion.files.atomic import whole_file
 from magfusion.files.pose_rows import PoseRows
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NS_PER_S
 
+# Exponents of ten of a second; a stamp beyond the year 2100 in seconds is in a smaller unit.
+TIME_UNITS = {"s": 0, "ms": -3, "us": -6, "ns": -9}
+_LATEST_S = 4.1e9
 _COLUMNS = "time_s x y z qx qy qz qw"
 _POSITIONS = "time_s x y z"
 _EIGHT = f"eight numbers: {_COLUMNS}"
@@ -47,8 +50,9 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     """
     lines = _lines(path)
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
-    values = np.array([_numbers(path, number, text, count) for number, text in lines])
-    stamps = np.array([_stamp(path, number, text) for number, text in lines], dtype=np.int64)
+    numbers = np.array([_numbers(path, number, text, count) for number, text in lines])
+    values, unit = numbers[:, 1:], tum_time_unit(np.max(np.abs(numbers[:, 0])))
+    stamps = np.array([_stamp(path, number, text, unit) for number, text in lines], dtype=np.int64)
     time = Span(epoch_ns).seconds(stamps)
     for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
         _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")
@@ -59,12 +63,21 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     if not poses.kept.any():
         raise InputError(f"{path}: none of its {len(lines)} lines has a pose; record it again.")
     if noticed is not None:
+        if unit != "s":
+            text = f"{path.name}: its times are read as {unit}; in s they are no dates."
+            noticed.append(Finding("stamp_resolution", text, Verdict.TRUSTWORTHY))
         noticed += poses.findings(path.name)
     time, position = time[poses.kept], values[poses.kept, :3]
     if poses.quaternion is None:
         return Trajectory(time, np.full((len(time), 3, 3), np.nan), position)
     rotation = Rotation.from_quat(poses.quaternion[poses.kept]).as_matrix()
     return Trajectory(time, rotation, position)
+
+
+def tum_time_unit(largest: float) -> str:
+    """Return the unit in which the largest stamp of a file is no date beyond 2100; else s."""
+    fitting = [name for name, power in TIME_UNITS.items() if largest * 10.0**power < _LATEST_S]
+    return fitting[0] if fitting else "s"
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -82,7 +95,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
-    """Return position and quaternion; NaN for what is not finite."""
+    """Return time, position and quaternion; NaN for what is not finite."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
@@ -90,12 +103,12 @@ def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
     if len(values) != count or not abs(values[0]) < LARGEST_NUMBER:
         wanted = f"four numbers: {_POSITIONS}" if count == 4 else _EIGHT
         _refuse(path, number, repr(text[:60]), wanted)
-    return [value if abs(value) < LARGEST_NUMBER else np.nan for value in values[1:]]
+    return [value if abs(value) < LARGEST_NUMBER else np.nan for value in values]
 
 
-def _stamp(path: Path, number: int, text: str) -> int:
+def _stamp(path: Path, number: int, text: str, unit: str) -> int:
     try:
-        stamp = round(Decimal(text.split()[0]) * NS_PER_S)
+        stamp = round(Decimal(text.split()[0]).scaleb(TIME_UNITS[unit]) * NS_PER_S)
     except InvalidOperation:
         stamp = LARGEST_TIME_NS + 1
     if abs(stamp) > LARGEST_TIME_NS:

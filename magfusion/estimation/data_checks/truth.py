@@ -199,27 +199,27 @@ def _cause(attitude: Rotation, rows: IntArray, gyro: Array, change: Array) -> st
     )
 
 
-def quaternion_text(attitude: Rotation, rows: IntArray, turned: Array) -> str:
+def quaternion_text(attitude: Rotation, rows: IntArray, rotations: Array) -> str:
     """Return the order or the direction of its quaternion in which a truth turns as others do.
 
-    `rows`: pairs of its samples, shape (m, 2). `turned`: rotation vectors between them in body
+    `rows`: pairs of its samples, shape (m, 2). `rotations`: rotation vectors between them in body
     axes, of a gyroscope or an estimate, shape (m, 3) (rad).
     """
-    size = np.linalg.norm(turned, axis=1)
+    size = np.linalg.norm(rotations, axis=1)
     active = (size > LEAST_TURN) & (size < 0.5 * np.pi)
-    rows, turned = rows[active], turned[active]
-    if len(rows) < MIN_SPANS or _agrees(rotation_changes(attitude, rows), turned):
+    rows, rotations = rows[active], rotations[active]
+    if len(rows) < MIN_SPANS or _agrees(rotation_changes(attitude, rows), rotations):
         return ""
     for name, (places, order) in ORDERS.items():
         meant = Rotation.from_quat(
             attitude.as_quat(scalar_first=True)[:, places], scalar_first=True
         )
-        if _agrees(rotation_changes(meant, rows), turned):
+        if _agrees(rotation_changes(meant, rows), rotations):
             return (
                 f"its quaternion is in another order: {name}. Import it with --map"
                 f" 'truth.quaternion=NAMES[{order}]'."
             )
-    if _agrees(rotation_changes(attitude.inv(), rows), turned):
+    if _agrees(rotation_changes(attitude.inv(), rows), rotations):
         return (
             "its attitudes are body_from_world. Import it with inverted signs: --map"
             " 'truth.quaternion=-QX,-QY,-QZ,QW[xyzw]', with the names of its columns."

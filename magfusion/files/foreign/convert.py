@@ -298,7 +298,14 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
     if not counts.written:
         reasons = ", ".join(f"{n} {reason}" for reason, n in counts.left_out.items())
         result = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
-        raise InputError(f"{place}: {result} for {stream}; record it again, or map other columns.")
+        remedy = "record it again, or map other columns"
+        if plan.rate is None and counts.left_out.get("without a time", 0) == counts.read > 0:
+            unit = plan.terms[TIME][0].unit
+            remedy = (
+                f"the times are empty, or beyond any clock in {unit}: give their unit by --map"
+                f" '{stream}.time=NAME[ns]'"
+            )
+        raise InputError(f"{place}: {result} for {stream}; {remedy}.")
     off = counts.left_out.get("with a quaternion not of unit length", 0)
     if off > FEW_OFF * (counts.written + off):
         raise InputError(
