@@ -15,7 +15,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.results.association import associate
 from magfusion.results.figures import Figure, Figures, Section
-from magfusion.results.truth_frame import frame_remarks
+from magfusion.results.truth_frame import frame_remarks, unit_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +62,16 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     noticed: list[Finding] = []
     true, epoch_ns, remarks = _read_truth(settings, noticed)
     result = _read_estimate(settings, epoch_ns, noticed)
-    remarks = [*(finding.text for finding in noticed), *remarks]
     with named(f"{settings.estimate} against {settings.truth}"):
         result, aligned = _aligned(settings, result, true)
+        pairs = associate(result, true)
+        # In a smaller unit no step is small enough for an interpolation to millimetres.
+        unit = unit_text(associate(result, true, any_motion=True))
+        if unit and len(pairs.truth) < 3:
+            raise InputError(unit)
         errors = error_figures(trajectory_errors(result, true))
-        remarks = [*remarks, *frame_remarks(associate(result, true))]
+        frames = [unit] if unit else frame_remarks(pairs, inertial=bool(remarks))
+    remarks = [*(finding.text for finding in noticed), *remarks, *frames]
     notes = Figures(*[Figure("notes", remarks, section=Section.NOTES)] * bool(remarks))
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | aligned | notes
 

@@ -1,9 +1,17 @@
-"""What a constant of the frames, or a standstill of the tracker, explains of a truth's errors."""
+"""What a constant of frames, clock or unit, or a standstill, explains of a truth's errors."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.data_checks.truth import LEAST_TURN, SPAN
+from magfusion.estimation.data_checks.truth import (
+    LEAST_DELAY,
+    LEAST_TURN,
+    MAX_DELAY,
+    SPAN,
+    attitude_spans,
+    quaternion_text,
+    rotation_changes,
+)
 from magfusion.results.association import AssociatedPoses
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -18,9 +26,79 @@ FROZEN_SHARE = 0.01  # of the compared poses
 UP_FROM_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def frame_remarks(pairs: AssociatedPoses) -> list[str]:
-    """Return sentences on the frames of a truth, each with its remedy."""
-    return [text for text in (_frozen_text(pairs), _world_text(pairs), _body_text(pairs)) if text]
+# Lengths of other units (m), and how far from their ratio an estimate may be.
+UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "km": 1e3}
+UNIT_TOLERANCE = 0.1
+
+
+def frame_remarks(pairs: AssociatedPoses, *, inertial: bool = False) -> list[str]:
+    """Return sentences on frames and clock of a truth, each with its remedy.
+
+    `inertial`: whether the truth contradicts the inertial samples, which names the cause better.
+    """
+    frozen, other = _frozen_text(pairs), ""
+    if not frozen and not inertial:
+        other = _quaternion_text(pairs) or _delay_text(pairs)
+    return [text for text in (frozen, other, _world_text(pairs), _body_text(pairs)) if text]
+
+
+def unit_text(pairs: AssociatedPoses) -> str:
+    """Return the unit of the truth's positions, where they are an estimate's times its ratio."""
+    own, true = pairs.estimate, pairs.truth
+    if not (own.has_position and true.has_position and len(true) > MIN_TURNS):
+        return ""
+    moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
+    length = np.linalg.norm(moved)
+    scale = np.linalg.norm(target) / max(float(length), 1e-12)
+    for unit, size in UNITS.items():
+        if abs(scale * size - 1.0) < UNIT_TOLERANCE:
+            _, residual = Rotation.align_vectors(size * target, moved)
+            if residual < EXPLAINED * length:
+                return (
+                    f"The truth's positions are {scale:.3g} times those of the estimate: they are"
+                    f" in {unit}. Import it with --map 'truth.position=NAMES[{unit}]'."
+                )
+    return ""
+
+
+def _quaternion_text(pairs: AssociatedPoses) -> str:
+    """Return the order or the direction of the truth's quaternion that the estimate shows."""
+    own, true = pairs.estimate, pairs.truth
+    if not (own.has_attitude and true.has_attitude):
+        return ""
+    rows = attitude_spans(true.time)
+    text = quaternion_text(true.rotation, rows, rotation_changes(own.rotation, rows))
+    return f"The truth's {text.removeprefix('its ')}" if text else ""
+
+
+def _delay_text(pairs: AssociatedPoses) -> str:
+    """Return by how much the truth's clock is late, where errors are proportional to motion."""
+    own, true = pairs.estimate, pairs.truth
+    if len(true) <= MIN_TURNS:
+        return ""
+    errors: list[tuple[Array, Array]] = []
+    if own.has_position and true.has_position:
+        moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
+        turn, _ = Rotation.align_vectors(target, moved)
+        errors.append((turn.apply(moved) - target, np.gradient(target, true.time, axis=0)))
+    if own.has_attitude and true.has_attitude:
+        ahead = np.arange(1, len(true))
+        step = rotation_changes(true.rotation, np.stack([ahead - 1, ahead], axis=1))
+        rate = step / np.diff(true.time)[:, None]
+        off = (true.rotation.inv() * own.rotation).as_rotvec()
+        errors.append((0.5 * (off[1:] + off[:-1]), rate))
+    for error, speed in errors:
+        error, speed = error - error.mean(axis=0), speed - speed.mean(axis=0)
+        square = float(np.sum(speed**2))
+        delay = float(np.sum(error * speed)) / max(square, 1e-12)
+        remaining = float(np.sum((error - delay * speed) ** 2))
+        if LEAST_DELAY < abs(delay) < MAX_DELAY and remaining < EXPLAINED * np.sum(error**2):
+            word = "late" if delay > 0.0 else "early"
+            return (
+                f"The truth's clock is about {1e3 * abs(delay):.0f} ms {word} against the"
+                " estimate's: give --align-time."
+            )
+    return ""
 
 
 def _frozen_text(pairs: AssociatedPoses) -> str:

@@ -13,7 +13,15 @@ import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.arrays import array_source
-from magfusion.files.foreign.columns import EULER, STREAMS, TIME, VELOCITY, Term, terms_by_place
+from magfusion.files.foreign.columns import (
+    EULER,
+    QUATERNION,
+    STREAMS,
+    TIME,
+    VELOCITY,
+    Term,
+    terms_by_place,
+)
 from magfusion.files.foreign.convert import converted_rows
 from magfusion.files.foreign.guess import named_columns
 from magfusion.files.foreign.guess_by_values import likely_time_unit
@@ -78,6 +86,26 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         truth=_truth(tables.get("truth"), span, noticed),
         noticed=(*noticed, *of_imu, *of_waveform),
     )
+
+
+def read_euroc_poses(path: Path, epoch_ns: int, noticed: list[Finding] | None) -> Trajectory:
+    """Read a table of poses whose head names them as EuRoC's ground truth does.
+
+    `noticed` as of `read_trajectory`. Raises InputError where the head names no whole poses.
+    """
+    source = array_source(path) if path.suffix == ".parquet" else text_source(path)
+    named = named_columns(source.columns, "truth")
+    whole = TIME, "position_x", "position_y", "position_z", *QUATERNION
+    if any(len(named[name]) != 1 for name in whole):
+        names = ", ".join(column.name for column in source.columns)
+        raise InputError(
+            f"{path}: has no column {TIME_NS}, and its head ({names}) is not that of EuRoC; convert"
+            f" it by magfusion import --truth {path}."
+        )
+    table = _read("truth", path)
+    if noticed is not None:
+        noticed += table.noticed
+    return read_trajectory(path, epoch_ns, content=table.content, noticed=noticed)
 
 
 def euroc_tables(path: Path) -> dict[str, Path]:
