@@ -162,6 +162,7 @@ def _seconds(stamp: str) -> str:
         (lambda stamp: f"{float(stamp):.18e}", 256, "as ns; their resolution is 0.256 us"),
         (_seconds, 1000, "as s; their resolution is 1 us"),
         (lambda stamp: stamp[:-3], 1000, "as us; their resolution is 1 us"),
+        (lambda stamp: stamp[:-6], 10**6, "as ms; their resolution is 1 ms"),
     ],
 )
 def test_stamps_of_a_euroc_folder_are_read_as_what_they_are(

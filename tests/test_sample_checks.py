@@ -71,7 +71,11 @@ SPOILED: dict[str, tuple[Change, tuple[str, ...], str]] = {
         ("saturated",),
         "its converter overflows",
     ),
-    "field axis dead": (field(stuck(2, 1e-5)), ("stuck_axis",), "axis z frozen at 10 uT"),
+    "field axis dead": (
+        field(stuck(2, 1e-5)),
+        ("stuck_axis",),
+        "100 % of the log: it is dead or not connected. Repair",
+    ),
     "field iron": (
         field(lambda v: v + np.array([9e-6, -6e-6, 3e-6])),
         ("body_iron",),

@@ -196,7 +196,8 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     size = resolution_ns(first_values(source, term.place, True), term.unit)
     if size <= 1.0:
         return ()
-    text = f"{stream}: stamps are read as {term.unit}; their resolution is {size * 1e-3:.3g} us."
+    shown = f"{size * 1e-3:.3g} us" if size < 1e6 else f"{size * 1e-6:.3g} ms"
+    text = f"{stream}: stamps are read as {term.unit}; their resolution is {shown}."
     return (Finding("stamp_resolution", text, _REMARK),)
 
 
