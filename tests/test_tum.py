@@ -83,13 +83,13 @@ def test_comments_and_empty_lines_are_passed_over(tmp_path: Path) -> None:
         (f"#\n{GOOD} 9\n", "line 2: .*eight numbers"),
         (GOOD.replace(" ", ","), "line 1: .*eight numbers"),
         (GOOD.replace("3", "three"), "line 1: .*eight numbers"),
-        (GOOD.replace("3", "nan"), "none of its 1 lines has a pose"),
+        (GOOD.replace("3", "nan"), "line 1: found .*; write a pose"),
         (GOOD.replace("0.0", "inf"), "line 1: .*eight numbers"),
         (GOOD.replace("0.0", "1e30"), "line 1: found time 1e30; write seconds"),
         (f"{GOOD}\n{GOOD}\n", "line 2: found time 0.0; write increasing times"),
         (f"1.0{GOOD[3:]}\n# back\n{GOOD}\n", "line 3: found time 0.0"),
         (f"{GOOD}\n1.0 1 2 3 0 0 0 1.01\n", "line 2: found a quaternion of length 1.01"),
-        ("0.0 1 2 3 0 0 0 0", "none of its 1 lines has a pose"),
+        ("0.0 1 2 3 0 0 0 0", "line 1: found .*; write a pose"),
     ],
 )
 def test_a_bad_file_is_refused_by_its_line(tmp_path: Path, text: str, sentence: str) -> None:

@@ -46,7 +46,7 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
     not text, empty, a line does not hold eight numbers (or four, of positions alone: as many as the
     first line), no line or too few a pose, or the times do not increase. `noticed`: receives the
-    number of lines without a pose, which are left out.
+    number of lines without a pose, which are left out; without it they are refused.
     """
     lines = _lines(path)
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
@@ -60,6 +60,8 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     for k in np.flatnonzero(poses.refused)[:1]:
         result = f"a quaternion of length {poses.length[k]:.6g}"
         _refuse(path, lines[k][0], result, "one of length 1")
+    for k in np.flatnonzero(~poses.kept & (noticed is None))[:1]:
+        _refuse(path, lines[k][0], repr(lines[k][1][:60]), "a pose")
     if not poses.kept.any():
         raise InputError(f"{path}: none of its {len(lines)} lines has a pose; record it again.")
     if noticed is not None:

@@ -281,7 +281,8 @@ def read_any_poses(
 ) -> Trajectory:
     """Read a trajectory as `read_estimate`, which may have positions or attitudes alone.
 
-    `noticed`: receives the number of rows without a pose, which are left out.
+    `noticed`: receives the number of rows without a pose, which are left out; without it they are
+    refused.
     """
     if path.is_dir():
         if not (path / "trajectory.parquet").is_file():
