@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.files.log import write_log
+from magfusion.files.trajectory_table import write_trajectory
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -158,3 +159,7 @@ def test_check_and_evaluate_report_a_wrong_truth(
     assert "quaternion is in another order" in shown
     run_command("evaluate", tmp_path / "log" / "truth.parquet", tmp_path / "log")
     assert "quaternion is in another order" in capfd.readouterr().out
+    assert recorded.truth is not None
+    write_trajectory(recorded.truth, tmp_path / "estimate.parquet", recorded.epoch_ns)
+    run_command("evaluate", tmp_path / "estimate.parquet", tmp_path / "log")
+    assert capfd.readouterr().out.count("quaternion is in another order") == 1

@@ -70,8 +70,8 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
         if unit and len(pairs.truth) < 3:
             raise InputError(unit)
         errors = error_figures(trajectory_errors(result, true))
-        frames = [unit] if unit else frame_remarks(pairs, inertial=bool(remarks))
-    remarks = [*(finding.text for finding in noticed), *remarks, *frames]
+        frames = [*remarks, unit] if unit else frame_remarks(pairs, remarks)
+    remarks = [*(finding.text for finding in noticed), *frames]
     notes = Figures(*[Figure("notes", remarks, section=Section.NOTES)] * bool(remarks))
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | aligned | notes
 

@@ -1,5 +1,7 @@
 """What a constant of frames, clock or unit, or a standstill, explains of a truth's errors."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -31,15 +33,18 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "km": 1e3}
 UNIT_TOLERANCE = 0.1
 
 
-def frame_remarks(pairs: AssociatedPoses, *, inertial: bool = False) -> list[str]:
+def frame_remarks(pairs: AssociatedPoses, inertial: Sequence[str] = ()) -> list[str]:
     """Return sentences on frames and clock of a truth, each with its remedy.
 
-    `inertial`: whether the truth contradicts the inertial samples, which names the cause better.
+    `inertial`: how the truth contradicts the inertial samples of its log. They name a delay better
+    than the estimate does, which shows more of the rotation.
     """
-    frozen, other = _frozen_text(pairs), ""
-    if not frozen and not inertial:
-        other = _quaternion_text(pairs) or _delay_text(pairs)
-    return [text for text in (frozen, other, _world_text(pairs), _body_text(pairs)) if text]
+    frozen = _frozen_text(pairs)
+    quaternion = "" if frozen else _quaternion_text(pairs)
+    others = [quaternion] if quaternion else list(inertial)
+    if not frozen and not others:
+        others = [_delay_text(pairs)]
+    return [text for text in (frozen, *others, _world_text(pairs), _body_text(pairs)) if text]
 
 
 def unit_text(pairs: AssociatedPoses) -> str:
