@@ -283,6 +283,15 @@ def test_order_direction_clock_and_unit_of_a_truth_are_recognised_with_the_optio
     assert re.search(expected[mistake], note)
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_a_truth_at_rest_or_on_a_line_is_compared(
+    walked: Trajectory, report: Any, speed: float
+) -> None:
+    place = np.outer(speed * walked.time, [1.0, 0.0, 0.0])
+    still = np.tile(np.eye(3), (len(walked), 1, 1))
+    assert report(Trajectory(walked.time, still, place))["ate_m"] > 1.0
+
+
 def test_a_coarse_truth_in_millimetres_is_named_and_not_its_rate(
     walked: Trajectory, refuse: Refuse, tmp_path: Path
 ) -> None:

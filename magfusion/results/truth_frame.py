@@ -57,13 +57,26 @@ def unit_text(pairs: AssociatedPoses) -> str:
     scale = np.linalg.norm(target) / max(float(length), 1e-12)
     for unit, size in UNITS.items():
         if abs(scale * size - 1.0) < UNIT_TOLERANCE:
-            _, residual = Rotation.align_vectors(size * target, moved)
-            if residual < EXPLAINED * length:
+            off = _rotated(moved, size * target) - size * target
+            if np.linalg.norm(off) < EXPLAINED * length:
                 return (
                     f"The truth's positions are {scale:.3g} times those of the estimate: they are"
                     f" in {unit}. Import it with --map 'truth.position=NAMES[{unit}]'."
                 )
     return ""
+
+
+def _is_flat(vectors: Array) -> bool:
+    """Return whether vectors (n, 3) are along a line, about which the roll is open."""
+    extent = np.linalg.svd(vectors, compute_uv=False)
+    return bool(extent[1] < MIN_FLATNESS * extent[0] or extent[1] == 0.0)
+
+
+def _rotated(moved: Array, target: Array) -> Array:
+    """Return one centred path (n, 3) rotated to fit another; as it is along a line."""
+    if _is_flat(moved) or _is_flat(target):
+        return moved
+    return np.asarray(Rotation.align_vectors(target, moved)[0].apply(moved))
 
 
 def _quaternion_text(pairs: AssociatedPoses) -> str:
@@ -84,8 +97,7 @@ def _delay_text(pairs: AssociatedPoses) -> str:
     errors: list[tuple[Array, Array]] = []
     if own.has_position and true.has_position:
         moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
-        turn, _ = Rotation.align_vectors(target, moved)
-        errors.append((turn.apply(moved) - target, np.gradient(target, true.time, axis=0)))
+        errors.append((_rotated(moved, target) - target, np.gradient(target, true.time, axis=0)))
     if own.has_attitude and true.has_attitude:
         ahead = np.arange(1, len(true))
         step = rotation_changes(true.rotation, np.stack([ahead - 1, ahead], axis=1))
@@ -156,8 +168,7 @@ def _world_turn(pairs: AssociatedPoses) -> Rotation | None:
     own, true = pairs.estimate, pairs.truth
     if own.has_position and true.has_position:
         moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
-        extent = np.linalg.svd(moved, compute_uv=False)
-        if extent[1] < MIN_FLATNESS * extent[0] or extent[1] == 0.0:
+        if _is_flat(moved) or _is_flat(target):
             return None
         turn, residual = Rotation.align_vectors(target, moved)
         return turn if residual < EXPLAINED * np.linalg.norm(target - moved) else None
@@ -199,8 +210,7 @@ def _body_turn(pairs: AssociatedPoses) -> Rotation | None:
         (p.rotation[:-step].inv() * p.rotation[step:]).as_rotvec() for p in (own, true)
     )
     active = np.linalg.norm(moved, axis=1) > LEAST_TURN
-    extent = np.linalg.svd(moved[active], compute_uv=False) if active.any() else np.zeros(3)
-    if np.sum(active) < MIN_TURNS or extent[1] < MIN_FLATNESS * extent[0]:
+    if np.sum(active) < MIN_TURNS or _is_flat(moved[active]) or _is_flat(target[active]):
         return None
     body, residual = Rotation.align_vectors(moved[active], target[active])
     return body if residual < EXPLAINED * np.linalg.norm(target[active]) else None
