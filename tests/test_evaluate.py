@@ -283,6 +283,17 @@ def test_order_direction_clock_and_unit_of_a_truth_are_recognised_with_the_optio
     assert re.search(expected[mistake], note)
 
 
+def test_a_lever_arm_along_the_motion_is_no_delay_of_a_clock(
+    walked: Trajectory, report: Any
+) -> None:
+    ahead = walked.position_world + walked.world_from_body @ [0.3, 0.0, 0.0]
+    text = str(report(replace(walked, position_world=ahead)).get("notes", ""))
+    assert "clock" not in text
+    late = positions(replace(walked, time=walked.time + 0.2), walked.position_world)
+    assert "ms late" in str(report(late)["notes"])
+    assert "--align-time, or --lever-arm" in str(report(late)["notes"])
+
+
 @pytest.mark.parametrize("speed", [0.0, 0.5])
 def test_a_truth_at_rest_or_on_a_line_is_compared(
     walked: Trajectory, report: Any, speed: float

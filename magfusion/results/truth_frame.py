@@ -14,6 +14,7 @@ from magfusion.estimation.data_checks.truth import (
     quaternion_text,
     rotation_changes,
 )
+from magfusion.results.alignment import MIN_RATE
 from magfusion.results.association import AssociatedPoses
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -94,28 +95,28 @@ def _delay_text(pairs: AssociatedPoses) -> str:
     own, true = pairs.estimate, pairs.truth
     if len(true) <= MIN_TURNS:
         return ""
-    errors: list[tuple[Array, Array]] = []
-    if own.has_position and true.has_position:
-        moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
-        errors.append((_rotated(moved, target) - target, np.gradient(target, true.time, axis=0)))
+    error, speed = np.zeros((1, 3)), np.zeros((1, 3))
+    other = ""
     if own.has_attitude and true.has_attitude:
         ahead = np.arange(1, len(true))
         step = rotation_changes(true.rotation, np.stack([ahead - 1, ahead], axis=1))
-        rate = step / np.diff(true.time)[:, None]
-        off = (true.rotation.inv() * own.rotation).as_rotvec()
-        errors.append((0.5 * (off[1:] + off[:-1]), rate))
-    for error, speed in errors:
-        error, speed = error - error.mean(axis=0), speed - speed.mean(axis=0)
-        square = float(np.sum(speed**2))
-        delay = float(np.sum(error * speed)) / max(square, 1e-12)
-        remaining = float(np.sum((error - delay * speed) ** 2))
-        if LEAST_DELAY < abs(delay) < MAX_DELAY and remaining < EXPLAINED * np.sum(error**2):
-            word = "late" if delay > 0.0 else "early"
-            return (
-                f"The truth's clock is about {1e3 * abs(delay):.0f} ms {word} against the"
-                " estimate's: give --align-time."
-            )
-    return ""
+        speed = step / np.diff(true.time)[:, None]
+        world = (own.rotation * true.rotation.inv()).mean()
+        off = (true.rotation.inv() * world.inv() * own.rotation).as_rotvec()
+        error = 0.5 * (off[1:] + off[:-1])
+    if np.std(speed) < MIN_RATE and own.has_position and true.has_position:
+        moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
+        error, speed = _rotated(moved, target) - target, np.gradient(target, true.time, axis=0)
+        other = ", or --lever-arm if it tracks a point ahead or behind"
+    error, speed = error - error.mean(axis=0), speed - speed.mean(axis=0)
+    delay = float(np.sum(error * speed)) / max(float(np.sum(speed**2)), 1e-12)
+    remaining = float(np.sum((error - delay * speed) ** 2))
+    if not LEAST_DELAY < abs(delay) < MAX_DELAY or remaining > EXPLAINED * np.sum(error**2):
+        return ""
+    return (
+        f"The truth's clock is about {1e3 * abs(delay):.0f} ms {'late' if delay > 0.0 else 'early'}"
+        f" against the estimate's: give --align-time{other}."
+    )
 
 
 def _frozen_text(pairs: AssociatedPoses) -> str:
