@@ -348,6 +348,31 @@ def test_too_few_samples_are_refused(resting: Path, tmp_path: Path, refuse: Refu
     assert "there is no such file" in refuse("allan", tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize(
+    ("name", "factor", "sentence"),
+    [
+        ("accel", 1 / 9.80665, "probably in g; multiply it by 9.8"),
+        ("field", 1e9, "divide nanotesla by 1e9"),
+    ],
+)
+def test_samples_in_another_unit_are_refused(
+    tmp_path: Path, refuse: Refuse, name: str, factor: float, sentence: str
+) -> None:
+    _rest(tmp_path / "log", 60.0, lambda built: built.update({name: factor * built[name]}))
+    assert sentence in refuse("allan", tmp_path / "log", "-o", tmp_path / "out")
+
+
+def test_an_axis_that_is_never_measured_is_named(tmp_path: Path, refuse: Refuse) -> None:
+    _rest(tmp_path / "log", 60.0)
+    table = pyarrow.parquet.read_table(tmp_path / "log" / "imu.parquet")
+    place = table.column_names.index("gyro_y")
+    empty = pyarrow.array(np.full(len(table), np.nan))
+    table = table.set_column(place, "gyro_y", empty)
+    pyarrow.parquet.write_table(table, tmp_path / "log" / "imu.parquet")
+    sentence = refuse("allan", tmp_path / "log", "-o", tmp_path / "out")
+    assert f"gyro_y is NaN in all {len(table)} rows of imu; repair the sensor" in sentence
+
+
 # Any length, the same memory ------------------------------------------------------------------
 
 

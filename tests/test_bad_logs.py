@@ -16,6 +16,7 @@ from magfusion.files.log import read_log, write_log
 from magfusion.files.parquet_bounds import MOST_ROWS
 from magfusion.files.plausible import check_imu
 from magfusion.files.table import Span
+from magfusion.files.trajectory_table import QUATERNION, read_trajectory
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.units import Array
 
@@ -124,10 +125,9 @@ BAD_TABLES = [
     ("fields", _set("beacon", 5, None), r"column beacon, row 5 .*found no value"),
     ("fields", _twice(1), r"row 2 .*the channel has two rows"),
     ("fields", _scale([*_axes("re"), *_axes("im")], 1e9), "divide nanotesla by 1e9"),
-    ("truth", _scale(["qw", "qx", "qy", "qz"], 1.002), r"qw to qz, row 0 .*found 1.002"),
+    ("truth", _scale(["qw", "qx", "qy", "qz"], 1.02), r"qw to qz, row 0 .*found 1.02"),
     ("truth", lambda c: c.pop("qw"), "column qw is missing"),
     ("truth", lambda c: c.pop("velocity_y"), "column velocity_y is missing"),
-    ("truth", _set("position_x", 9, float("nan")), r"column position_x, row 9"),
 ]
 
 
@@ -320,6 +320,43 @@ def test_samples_without_a_number_or_a_time_of_their_own_are_left_out_and_counte
     assert np.array_equal(after, np.delete(before, 9))
     assert [finding.code for finding in result.noticed] == ["repeated_stamps", "missing_samples"]
     assert all("1 samples" in finding.text for finding in result.noticed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ([_set("position_x", 9, None)], "truth: left out 1 of 100 rows: 1 without a pose."),
+        ([_set(q, 9, float("nan")) for q in QUATERNION], "truth: left out 1 of 100 rows"),
+        ([_set(q, 9, 0.0) for q in QUATERNION], "1 with a quaternion of zeros."),
+        ([_set("qw", 9, 3.0)], "1 with a quaternion not of unit length."),
+    ],
+)
+def test_rows_of_a_truth_without_a_pose_are_left_out_and_counted(
+    tmp_path: Path, changes: list[Callable[[dict[str, Any]], object]], text: str
+) -> None:
+    write_log(example_log(), tmp_path / "walk")
+    whole = read_log(tmp_path / "walk").truth
+    for change in changes:
+        _rewrite(tmp_path / "walk" / "truth.parquet", change)
+    log = read_log(tmp_path / "walk")
+    assert whole is not None
+    assert log.truth is not None
+    np.testing.assert_array_equal(log.truth.time, np.delete(whole.time, 9))
+    (finding,) = log.noticed
+    assert text in finding.text
+    every = read_trajectory(tmp_path / "walk" / "truth.parquet", log.epoch_ns, noticed=[])
+    assert len(every) == len(whole) - 1
+
+
+def test_quaternions_that_are_rounded_are_scaled_and_reported(tmp_path: Path) -> None:
+    write_log(example_log(), tmp_path / "walk")
+    _rewrite(tmp_path / "walk" / "truth.parquet", _scale([*QUATERNION], 1.002))
+    log = read_log(tmp_path / "walk")
+    assert log.truth is not None
+    np.testing.assert_allclose(np.linalg.det(log.truth.world_from_body), 1.0)
+    assert [f.text for f in log.noticed] == [
+        "truth: quaternions up to 0.2 % off were scaled to unit length."
+    ]
 
 
 def _imu(gyro_body: Array, accel_body: Array) -> ImuSamples:

@@ -1,5 +1,6 @@
 """Iron and magnets on the body: how large they are, the remedy, and what they explain."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,13 +9,16 @@ import pytest
 from mistake_remedy import follow_remedy
 from spoiled_log import Recorded, field, good
 
+from magfusion.errors import EstimationError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, fitted_iron
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.data_checks.still_means import still_means
+from magfusion.estimation.data_checks.turn_witness import left_handed_field
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.files.site import load_site, save_site
-from magfusion.model.trust import Finding
+from magfusion.jobs.magnetometer_trust import calibrated as calibrate_magnetometer
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 MAGNET = np.array([2e-5, 0.0, -1e-5])  # T, sensor axes
@@ -85,6 +89,39 @@ def test_what_a_magnet_explains_is_not_reported_beside_it() -> None:
 def test_without_rotation_no_iron_is_fitted() -> None:
     one = field(lambda v: v + MAGNET)(good("static"))
     assert fitted_iron(still_means(one.log, one.site, IRON_SPAN)) is None
+
+
+def calibration_failure(one: Recorded) -> str:
+    """Return why a calibration fails: without a solution, or by its verdict."""
+    try:
+        _, trust = calibrate_magnetometer(one.log, one.site)
+    except EstimationError as failure:
+        return str(failure)
+    assert trust.verdict is Verdict.FAILED
+    return " ".join(reason.text for reason in trust.reasons)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_a_reversed_axis_of_the_magnetometer_is_named_with_hard_iron(
+    axis: int, offset: float
+) -> None:
+    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+    one = field(lambda v: v * signs + offset * MAGNET)(good("turn", 0))
+    sensor = one.site.platform.magnetometer
+    assert left_handed_field(good("turn", 0).log, one.site) is None
+    assert left_handed_field(field(lambda v: v + MAGNET)(good("turn", 0)).log, one.site) is None
+    place = int(np.argmax(np.abs(sensor.body_from_sensor[:, axis])))
+    finding = left_handed_field(one.log, one.site)
+    assert finding is not None
+    assert f"the sign of {'xyz'[place]} (body axes) reversed" in finding.text
+    assert any("axes are left-handed" in f.text for f in recorded(one.log, one.site))
+    assert "axes are left-handed" in calibration_failure(one)
+
+
+def test_a_calibration_that_fails_names_the_saturation() -> None:
+    one = field(lambda v: np.clip(v, -2e-5, 2e-5))(good("turn", 0))
+    assert re.search(r"magnetometer: axis \w is saturated at", calibration_failure(one))
 
 
 @pytest.mark.slow

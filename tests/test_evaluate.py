@@ -1,6 +1,8 @@
 """What users of evo have as a truth: positions or attitudes alone, other frames, clocks, points."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import read_trajectory, trajectory_columns, write_trajectory
 from magfusion.files.tum import read_tum, write_tum
+from magfusion.jobs.inputs import read_any_poses
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.truth_poses import truth_poses
 from magfusion.results.alignment import clock_offset
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -255,6 +259,90 @@ def test_a_coarse_truth_of_a_fast_motion_is_compared_at_its_samples(
     inside = (coarse.time >= walked.time[3]) & (coarse.time <= walked.time[-13])
     assert shown["compared_epochs"] == np.sum(inside)
     assert shown["ate_m"] < 3.0 * NOISE
+
+
+@pytest.mark.parametrize("mistake", ["order", "inverse", "late", "mm"])
+def test_order_direction_clock_and_unit_of_a_truth_are_recognised_with_the_option(
+    walked: Trajectory, report: Any, mistake: str
+) -> None:
+    quaternion = walked.rotation.as_quat(scalar_first=True)
+    attitude = {
+        "order": Rotation.from_quat(quaternion, scalar_first=False).as_matrix(),
+        "inverse": walked.rotation.inv().as_matrix(),
+    }.get(mistake, walked.world_from_body)
+    time = walked.time + (0.3 if mistake == "late" else 0.0)
+    place = walked.position_world * (1e3 if mistake == "mm" else 1.0)
+    notes = report(Trajectory(time, attitude, place))["notes"]
+    (note,) = [one for one in notes if one.startswith("The truth's")]
+    expected = {
+        "order": r"--map 'truth.quaternion=NAMES\[wxyz\]'",
+        "inverse": r"body_from_world.*--map 'truth.quaternion=-QX,-QY,-QZ,QW\[xyzw\]'",
+        "late": r"about (2[6-9]|3[0-4])\d ms late .* give --align-time",
+        "mm": r"positions are 1e\+03 times .* in mm. .*truth.position=NAMES\[mm\]",
+    }
+    assert re.search(expected[mistake], note)
+
+
+def test_a_lever_arm_along_the_motion_is_no_delay_of_a_clock(
+    walked: Trajectory, report: Any
+) -> None:
+    ahead = walked.position_world + walked.world_from_body @ [0.3, 0.0, 0.0]
+    text = str(report(replace(walked, position_world=ahead)).get("notes", ""))
+    assert "clock" not in text
+    late = positions(replace(walked, time=walked.time + 0.2), walked.position_world)
+    assert "ms late" in str(report(late)["notes"])
+    assert "--align-time, or --lever-arm" in str(report(late)["notes"])
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_a_truth_at_rest_or_on_a_line_is_compared(
+    walked: Trajectory, report: Any, speed: float
+) -> None:
+    place = np.outer(speed * walked.time, [1.0, 0.0, 0.0])
+    still = np.tile(np.eye(3), (len(walked), 1, 1))
+    assert report(Trajectory(walked.time, still, place))["ate_m"] > 1.0
+
+
+def test_a_coarse_truth_in_millimetres_is_named_and_not_its_rate(
+    walked: Trajectory, refuse: Refuse, tmp_path: Path
+) -> None:
+    coarse = rows(walked, slice(None, None, 41))
+    write_trajectory(rows(walked, slice(1001, 5000, 200)), tmp_path / "e.parquet", 0)
+    away = Trajectory(coarse.time, coarse.world_from_body, 1e3 * coarse.position_world)
+    write_trajectory(away, tmp_path / "t.parquet", 0)
+    assert "they are in mm" in refuse("evaluate", tmp_path / "e.parquet", tmp_path / "t.parquet")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [],"
+        " q_RS_z []",
+        "timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z",
+    ],
+)
+def test_the_truth_of_euroc_is_read_and_other_heads_are_for_import(
+    walked: Trajectory, estimate: Trajectory, tmp_path: Path, refuse: Refuse, head: str
+) -> None:
+    write_trajectory(estimate, tmp_path / "e.parquet", 0)
+    stamps = np.rint(walked.time * 1e9).astype(np.int64)
+    poses = np.hstack([walked.position_world, walked.rotation.as_quat(scalar_first=True)])
+    lines = [f"{t},{','.join(map(str, row))}" for t, row in zip(stamps, poses, strict=True)]
+    lines[5] = f"{stamps[5]},nan,nan,nan,nan,nan,nan,nan"
+    (tmp_path / "t.csv").write_text("\n".join([head, *lines]))
+    read = read_any_poses(tmp_path / "t.csv", noticed=[])
+    np.testing.assert_allclose(read.position_world, np.delete(walked.position_world, 5, axis=0))
+    np.testing.assert_allclose(read.world_from_body[0], walked.world_from_body[0], atol=1e-12)
+    (tmp_path / "t.csv").write_text("\n".join(["a,b,c,d,e,f,g,h", *lines]))
+    sentence = refuse("evaluate", tmp_path / "e.parquet", tmp_path / "t.csv")
+    assert "convert it by magfusion import --truth" in sentence
+
+
+def test_dates_are_shown_to_the_millisecond(walked: Trajectory) -> None:
+    late = replace(walked, time=walked.time + 1.7e9)
+    _, covered, reason = truth_poses(late, late.time[::100] - 10.0)
+    assert not covered.all()
+    assert "outside of its 1700000000 to 17000000" in reason
 
 
 def test_a_truth_that_stands_is_reported(walked: Trajectory, report: Any) -> None:

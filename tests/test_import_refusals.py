@@ -4,6 +4,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -13,6 +14,8 @@ from conftest import Refuse, run_command
 from example_bag import FIELD, SENSORS, field_message, write_bag
 
 from magfusion.cli import main
+from magfusion.errors import InputError
+from magfusion.files.fields import refuse_unsigned
 from magfusion.files.log import read_log
 
 ROWS = 400
@@ -239,6 +242,58 @@ def test_a_bag_of_which_something_is_open(
     monkeypatch.chdir(tmp_path)
     write_bag(tmp_path / "run", SENSORS | {"/mag2": (FIELD, field_message)})
     assert re.search(pattern, reported(capfd, f"run {maps}"), re.S)
+
+
+@pytest.mark.parametrize(("signs", "refused"), [((1.0,), True), ((1.0, -1.0), False)])
+def test_amplitudes_of_three_axes_are_no_parts_in_phase(
+    tables: Path, capfd: pytest.CaptureFixture[str], signs: tuple[float, ...], refused: bool
+) -> None:
+    rows = [
+        [f"{0.4 * k}", beacon, "0", axis, f"{(20.0 + k) * signs[k % len(signs)]}", "0.5", "0.4"]
+        for k in range(12)
+        for beacon in "AB"
+        for axis in "xyz"
+    ]
+    write(tables / "f.csv", "t_s,beacon,tone,axis,value [nT],sigma [nT],window [s]", rows)
+    if refused:
+        text = reported(capfd, "imu.csv --fields f.csv")
+        assert "so they are amplitudes, which are for receivers of one axis; give re and im" in text
+        return
+    run_command("import", "imu.csv", "--fields", "f.csv", "-o", "log")
+    log = read_log(Path("log"))
+    assert log.fields is not None
+    absolute = np.abs(log.fields.phasor_sensor.real).astype(complex)
+    fields = replace(log.fields, phasor_sensor=absolute)
+    refuse_unsigned(fields, np.zeros(2), "log")  # levels
+    with pytest.raises(InputError, match="log: the components of three axes are never negative"):
+        refuse_unsigned(fields, np.full(2, 20.0), "log")
+
+
+def test_a_tum_truth_in_milliseconds_is_read_and_other_times_beyond_a_clock_are_named(
+    tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    start = 1_700_000_000_000
+    stamped = [[f"{start + t:.0f}", *row] for t, row in zip(TIME, rows_of(RATES), strict=True)]
+    write(
+        tables / "imu.csv",
+        IMU_HEAD,
+        [[*a[:4], *b] for a, b in zip(stamped, rows_of(FORCES), strict=True)],
+    )
+    write(
+        tables / "mag.csv",
+        FIELD_HEAD,
+        [[a[0], *b] for a, b in zip(stamped, rows_of(FIELDS), strict=True)],
+    )
+    poses = [f"{start + 100 * k} 0 0 {k} 0 0 0 1" for k in range(15)]
+    (tables / "t.tum").write_text("\n".join(poses) + "\n")
+    write(tables / "t.csv", "t_s,px_m,py_m,pz_m", [row.split()[:4] for row in poses])
+    text = reported(capfd, f"{BOTH} --truth t.csv")
+    assert "beyond any clock in s: give their unit by --map 'truth.time=NAME[ns]'" in text
+    run_command("import", *BOTH.split(), "--truth", "t.tum", "-o", "log")
+    assert "truth.time=0[ms]" in capfd.readouterr().out
+    truth = read_log(Path("log")).truth
+    assert truth is not None
+    assert len(truth) == 15
 
 
 def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:

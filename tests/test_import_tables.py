@@ -13,7 +13,7 @@ from magfusion.files.foreign.dialect import find_dialect
 from magfusion.files.foreign.guess import named_columns, streams_of
 from magfusion.files.foreign.plan import Findings, plan_stream
 from magfusion.files.foreign.source import SourceColumn
-from magfusion.files.foreign.text import TORN, text_source
+from magfusion.files.foreign.text import REPEATED, TORN, text_source
 from magfusion.files.foreign.units import (
     NO_STAMP,
     UNITS,
@@ -294,6 +294,17 @@ def test_rows_are_sorted_and_what_is_left_out_is_counted(tmp_path: Path) -> None
     written = pa.parquet.read_table(tmp_path / "m.parquet")
     assert written["time_ns"].to_pylist() == [10_000_000 * k for k in range(50)]
     np.testing.assert_allclose(written["field_z"].to_numpy(), 3e-9, rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize("delimiter", [",", "   "])
+def test_a_repeated_head_is_skipped_and_counted(tmp_path: Path, delimiter: str) -> None:
+    head = delimiter.join(("t_ms", "Bx_nT", "By_nT", "Bz_nT"))
+    rows = [delimiter.join((f"{10 * k}", "1", "2", "3")) for k in range(50)]
+    (tmp_path / "m.csv").write_text("\n".join([head, *rows[:20], head, *rows[20:]]) + "\n")
+    plan = plan_stream("magnetometer", text_source(tmp_path / "m.csv"), (), None, Findings())
+    assert plan is not None
+    counts = write_stream(plan, tmp_path / "m.parquet")
+    assert (counts.read, counts.written, counts.left_out) == (50, 50, {REPEATED: 1})
 
 
 def test_rows_of_other_streams_are_no_missing_samples(tmp_path: Path) -> None:

@@ -162,6 +162,7 @@ def _seconds(stamp: str) -> str:
         (lambda stamp: f"{float(stamp):.18e}", 256, "as ns; their resolution is 0.256 us"),
         (_seconds, 1000, "as s; their resolution is 1 us"),
         (lambda stamp: stamp[:-3], 1000, "as us; their resolution is 1 us"),
+        (lambda stamp: stamp[:-6], 10**6, "as ms; their resolution is 1 ms"),
     ],
 )
 def test_stamps_of_a_euroc_folder_are_read_as_what_they_are(
@@ -253,7 +254,7 @@ def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
         ),
         ("mag0", f"#t,a,b,c\n{START_NS},2e4,3e3,4e4\n", "divide nanotesla by 1e9"),
         ("mag0", f"#t\n{START_NS}\n", "columns field_x, field_y, field_z are missing"),
-        ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,0,0,0,0\n", "found 0.0"),
+        ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,2,0,0,0\n", "found 2.0"),
     ],
 )
 def test_a_bad_euroc_folder_is_refused(
@@ -386,8 +387,8 @@ def _spoil(part: str, name: str, value: float) -> Callable[[Any], object]:
             "topic /imu: angular_velocity is marked as not measured",
         ),
         (
-            SENSORS | {"/mocap": (POSE, _changed(pose_message, lambda m: _no_turn(m.pose)))},
-            f"topic /mocap: the message stamped {STAMPS[7]} ns has a quaternion of length 0",
+            SENSORS | {"/mocap": (POSE, lambda k: _twice_as_long(pose_message(k)))},
+            f"topic /mocap: the message stamped {STAMPS[0]} ns has a quaternion of length 2",
         ),
         (
             SENSORS | {"/imu/mag": (FIELD, lambda k: _scaled_field(k, 1e4))},
@@ -430,6 +431,12 @@ def test_samples_that_were_not_taken_are_left_out_of_a_bag_and_said(
         "missing_samples: truth: 1 samples are NaN. They are left out.",
     ]
     assert not open_log(bag, 0.11).noticed
+    untracked = _changed(pose_message, lambda message: _no_turn(message.pose))
+    log = open_log(write_bag(tmp_path / "zeros", SENSORS | {"/mocap": (POSE, untracked)}))
+    assert log.truth is not None
+    assert len(log.truth) == len(POSITION) - 1
+    text = f"truth: left out 1 of {len(POSITION)} rows: 1 with a quaternion of zeros."
+    assert [finding.text for finding in log.noticed] == [text]
 
 
 def _stamped(message: Any, k: int) -> Any:
@@ -439,6 +446,12 @@ def _stamped(message: Any, k: int) -> Any:
 
 def _no_turn(pose: Any) -> None:
     pose.orientation = xyz("Quaternion", np.zeros(4))
+
+
+def _twice_as_long(message: Any) -> Any:
+    for axis in "wxyz":
+        setattr(message.pose.orientation, axis, 2.0 * getattr(message.pose.orientation, axis))
+    return message
 
 
 def _scaled_field(k: int, factor: float) -> Any:

@@ -29,6 +29,7 @@ from spoiled_log import (
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.data_checks.gravity_and_field_checks import wrong_force
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial, white_density
+from magfusion.estimation.data_checks.range_step import range_step
 from magfusion.estimation.data_checks.samples import clipped
 from magfusion.estimation.data_checks.spectrum import aliased, mains_of
 from magfusion.estimation.data_checks.stamps import timing
@@ -72,7 +73,11 @@ SPOILED: dict[str, tuple[Change, tuple[str, ...], str]] = {
         ("saturated",),
         "its converter overflows",
     ),
-    "field axis dead": (field(stuck(2, 1e-5)), ("stuck_axis",), "axis z frozen at 10 uT"),
+    "field axis dead": (
+        field(stuck(2, 1e-5)),
+        ("stuck_axis",),
+        "100 % of the log: it is dead or not connected. Repair",
+    ),
     "field iron": (
         field(lambda v: v + np.array([9e-6, -6e-6, 3e-6])),
         ("body_iron",),
@@ -261,3 +266,16 @@ def test_one_axis_in_g_is_named_where_the_body_stays_level() -> None:
     (finding,) = wrong_force(means, None)
     assert finding.code == "accel_units"
     assert "its z is in g." in finding.text
+
+
+def test_a_range_that_is_switched_is_named_with_its_instant() -> None:
+    one = good()
+    wave = one.log.waveform
+    assert wave is not None
+    at = float(np.mean(wave.time[[0, -1]]))
+    doubled = wave.measured_sensor * np.where(wave.time < at, 1.0, 2.0)[:, None]
+    log = replace(one.log, waveform=replace(wave, measured_sensor=doubled))
+    assert not list(range_step(one.log, one.site))
+    (finding,) = range_step(log, one.site)
+    assert "a factor of 2 at" in finding.text
+    assert abs(float(finding.text.split(" s: ")[0].split()[-1]) - at) < 0.3  # s

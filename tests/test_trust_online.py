@@ -13,7 +13,6 @@ from test_checkpoint import _rest, same
 from test_navigate_stream import answered, records
 
 from magfusion.cli import main
-from magfusion.estimation.data_checks.running import nothing
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online import running_estimate
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
@@ -21,6 +20,7 @@ from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.imu_checks import judge_biases
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.recovery import LONGEST_WAIT, Attempts
+from magfusion.estimation.online_integrity.running import nothing
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site

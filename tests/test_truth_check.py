@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.files.log import write_log
+from magfusion.files.trajectory_table import write_trajectory
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -61,7 +62,9 @@ def _partly_frozen(attitude: Rotation) -> Rotation:
         (lambda r: r.inv(), "body_from_world"),
         (_frozen, "frozen in 100 %"),
         (_partly_frozen, "is frozen in"),
-        (lambda r: NED_FROM_ENU * r * FRD_FROM_FLU, "forward, right, down"),
+        (lambda r: NED_FROM_ENU * r * FRD_FROM_FLU, "is north, east, down and its body forward"),
+        (lambda r: r * FRD_FROM_FLU, "its body axes are forward, right, down"),
+        (lambda r: Rotation.identity(len(r)), "never rotates, .* positions alone"),
         (lambda r: NED_FROM_ENU * r, "points down"),
         (
             lambda r: TURN * r,
@@ -76,6 +79,29 @@ def test_a_wrong_truth_is_reported_with_its_cause(
     (finding,) = truth_findings(_with_attitude(recorded, change))
     assert finding.code == "truth_inconsistent"
     assert re.search(cause, finding.text)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda r: r, ""),
+        (lambda r: NED_FROM_ENU * r * FRD_FROM_FLU, "is north, east, down and its body forward"),
+        (lambda r: r * FRD_FROM_FLU, "points down"),  # of a body that never turns
+        (lambda r: Rotation.from_euler("x", 30.0, degrees=True) * r, "turned by 30 deg"),
+    ],
+)
+def test_a_truth_in_ned_is_recognised_without_a_rotation(
+    recorded: Log, change: Change, cause: str
+) -> None:
+    still = Rotation.from_euler("xyz", [6.0, -9.0, 40.0], degrees=True)
+    force = np.tile(still.inv().apply([0.0, 0.0, 9.81]), (len(recorded.imu), 1))
+    imu = ImuSamples(recorded.imu.time, np.zeros_like(force), force)
+    log = _with_attitude(recorded, lambda r: change(Rotation.concatenate([still] * len(r))))
+    assert log.truth is not None
+    truth = replace(log.truth, position_world=np.full_like(log.truth.position_world, np.nan))
+    texts = [finding.text for finding in truth_findings(replace(log, imu=imu, truth=truth))]
+    assert len(texts) == bool(cause)
+    assert all(cause in text for text in texts)
 
 
 @pytest.mark.parametrize("late", [0.15, -0.06, 0.6])
@@ -133,3 +159,7 @@ def test_check_and_evaluate_report_a_wrong_truth(
     assert "quaternion is in another order" in shown
     run_command("evaluate", tmp_path / "log" / "truth.parquet", tmp_path / "log")
     assert "quaternion is in another order" in capfd.readouterr().out
+    assert recorded.truth is not None
+    write_trajectory(recorded.truth, tmp_path / "estimate.parquet", recorded.epoch_ns)
+    run_command("evaluate", tmp_path / "estimate.parquet", tmp_path / "log")
+    assert capfd.readouterr().out.count("quaternion is in another order") == 1

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.tum import read_tum, write_tum
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
 
 GOOD = "0.0 1 2 3 0 0 0 1"
 
@@ -43,12 +44,13 @@ def test_evo_s_files_are_read(tmp_path: Path) -> None:
 
 
 def test_lines_that_were_written_twice_are_counted(tmp_path: Path) -> None:
-    trajectory, remarks = _trajectory(), list[str]()
+    trajectory, noticed = _trajectory(), list[Finding]()
     write_tum(trajectory, path := tmp_path / "t.tum", 0)
     path.write_text("".join(2 * line for line in path.read_text().splitlines(keepends=True)))
-    result = read_tum(path, 0, remarks)
+    result = read_tum(path, 0, noticed)
     np.testing.assert_allclose(result.time, trajectory.time, rtol=0, atol=1e-9)
-    assert remarks == [f"{path}: 4 samples are exact copies of others. They are left out."]
+    (finding,) = noticed
+    assert finding.text == f"{path}: 4 samples are exact copies of others. They are left out."
     with pytest.raises(InputError, match="increasing times"):
         read_tum(path)
 
@@ -90,16 +92,16 @@ def test_comments_and_empty_lines_are_passed_over(tmp_path: Path) -> None:
         ("", "holds no poses"),
         ("# only a comment\n", "holds no poses"),
         (f"{GOOD}\n1.0 1 2 3 0 0 0\n", "line 2: found '1.0 1 2 3 0 0 0'; write eight"),
-        (f"#\n{GOOD} 9\n", "line 2: .*eight finite numbers"),
-        (GOOD.replace(" ", ","), "line 1: .*eight finite numbers"),
-        (GOOD.replace("3", "three"), "line 1: .*eight finite numbers"),
-        (GOOD.replace("3", "nan"), "line 1: .*eight finite numbers"),
-        (GOOD.replace("0.0", "inf"), "line 1: .*eight finite numbers"),
+        (f"#\n{GOOD} 9\n", "line 2: .*eight numbers"),
+        (GOOD.replace(" ", ","), "line 1: .*eight numbers"),
+        (GOOD.replace("3", "three"), "line 1: .*eight numbers"),
+        (GOOD.replace("3", "nan"), "line 1: found .*; write a pose"),
+        (GOOD.replace("0.0", "inf"), "line 1: .*eight numbers"),
         (GOOD.replace("0.0", "1e30"), "line 1: found time 1e30; write seconds"),
         (f"{GOOD}\n{GOOD}\n", "line 2: found time 0.0; write increasing times"),
         (f"1.0{GOOD[3:]}\n# back\n{GOOD}\n", "line 3: found time 0.0"),
         (f"{GOOD}\n1.0 1 2 3 0 0 0 1.01\n", "line 2: found a quaternion of length 1.01"),
-        ("0.0 1 2 3 0 0 0 0", "line 1: found a quaternion of length 0"),
+        ("0.0 1 2 3 0 0 0 0", "line 1: found .*; write a pose"),
     ],
 )
 def test_a_bad_file_is_refused_by_its_line(tmp_path: Path, text: str, sentence: str) -> None:
@@ -107,6 +109,28 @@ def test_a_bad_file_is_refused_by_its_line(tmp_path: Path, text: str, sentence: 
     with pytest.raises(InputError, match=rf"t\.tum: .*{sentence}|t\.tum: {sentence}") as caught:
         read_tum(tmp_path / "t.tum")
     assert str(caught.value).count("\n") == 0
+
+
+@pytest.mark.parametrize("lost", ["nan nan nan nan nan nan nan", "0 0 0 0 0 0 0"])
+def test_lines_without_a_pose_are_left_out_and_counted(tmp_path: Path, lost: str) -> None:
+    lines = [f"{k} {lost if k == 3 else GOOD[4:]}" for k in range(12)]
+    (tmp_path / "t.tum").write_text("\n".join(lines))
+    noticed: list[Finding] = []
+    result = read_tum(tmp_path / "t.tum", noticed=noticed)
+    np.testing.assert_array_equal(result.time, np.delete(np.arange(12.0), 3))
+    assert noticed[0].text.startswith("t.tum: left out 1 of 12 rows: 1 with")
+
+
+@pytest.mark.parametrize(("unit", "zeros"), [("ms", 3), ("us", 6), ("ns", 9)])
+def test_dates_in_smaller_units_are_read_and_reported(
+    tmp_path: Path, unit: str, zeros: int
+) -> None:
+    lines = [f"{(1_700_000_000 + k) * 10**zeros} {GOOD[4:]}" for k in range(3)]
+    (tmp_path / "t.tum").write_text("\n".join(lines))
+    noticed: list[Finding] = []
+    result = read_tum(tmp_path / "t.tum", 1_700_000_000 * 10**9, noticed)
+    np.testing.assert_array_equal(result.time, [0.0, 1.0, 2.0])
+    assert f"t.tum: its times are read as {unit}" in noticed[0].text
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ ROOMS = {
         """,
         "files": """
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
-            plain_data plain_table plausible row_table site_draft site_ground
+            plain_data plain_table plausible pose_rows row_table site_draft site_ground
             lost_rows clock_steps site_values standard_streams stray_stamps
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept
             probe row_file survey table yaml_files

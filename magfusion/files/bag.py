@@ -19,10 +19,10 @@ from magfusion.files.clock_steps import ClockSetBack, clock_set_back
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.pose_rows import PoseRows
 from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, counted_back, stray_finding
 from magfusion.files.table import LARGEST_NUMBER, Span
-from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.aiding import AidingSamples, AidingSensor
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -123,7 +123,7 @@ def read_bag(
         source="bag: " + ", ".join(s.place for s in (imu, field, truth) if s is not None),
         imu=ImuSamples.empty() if imu is None else _imu(imu, span),
         waveform=None if field is None else _waveform(field, span),
-        truth=None if truth is None else _trajectory(truth, span),
+        truth=None if truth is None else _trajectory(truth, span, declared),
         noticed=tuple(declared),
         aiding=others,
     )
@@ -325,24 +325,24 @@ def _waveform(stream: _Stream, span: Span) -> Waveform | None:
     return Waveform(span.seconds(stream.time_ns), stream.values) if len(stream.values) else None
 
 
-def _trajectory(stream: _Stream, span: Span) -> Trajectory | None:
-    if not len(stream.values):
-        return None
-    quaternion = stream.values[:, 3:7]
-    length = np.linalg.norm(quaternion, axis=1)
-    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-    if off.any():
-        k = int(np.argmax(off))
+def _trajectory(stream: _Stream, span: Span, declared: list[Finding]) -> Trajectory | None:
+    poses = PoseRows.of(stream.values, stream.values[:, 3:7])
+    if poses.refused.any():
+        k = int(np.argmax(poses.refused))
         raise InputError(
             f"{stream.place}: the message stamped {stream.time_ns[k]} ns has a quaternion of"
-            f" length {length[k]:.6g}; write one of length 1."
+            f" length {poses.length[k]:.6g}; write one of length 1."
         )
-    rotation = Rotation.from_quat(quaternion)
-    velocity = stream.values[:, 7:]
+    declared += poses.findings(stream.name)
+    values = stream.values[poses.kept]
+    if not len(values) or poses.quaternion is None:
+        return None
+    rotation = Rotation.from_quat(poses.quaternion[poses.kept])
+    velocity = values[:, 7:]
     return Trajectory(
-        time=span.seconds(stream.time_ns),
+        time=span.seconds(stream.time_ns[poses.kept]),
         world_from_body=rotation.as_matrix(),
-        position_world=stream.values[:, :3].copy(),
+        position_world=values[:, :3].copy(),
         # Many publishers of odometry leave the twist unfilled.
         velocity_world=rotation.apply(velocity) if velocity.any() else None,
     )

@@ -19,6 +19,7 @@ _UPPER = np.triu_indices(3)
 _COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
 SAME_TIME = 1e-7  # s; less is rounding of stamps
 LEAST_ROWS = 8  # fewer may be zero in a component by their pose
+LEAST_SERIES = 6  # components of channels; signs of so many are all positive once in 64 poses
 _AMPLITUDE, _MAGNETOMETER = "amplitude", "magnetometer"
 _PARTS = {axis: (f"re_{axis}", f"im_{axis}") for axis in "xyz"}
 _LAYOUT = TableLayout(
@@ -94,6 +95,26 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     at = table.time[first], window[first]
     result = FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
     return replace(result, magnetometers=magnetometers)
+
+
+def refuse_unsigned(fields: FieldSamples, frequency_hz: Array, place: Path | str) -> None:
+    """Refuse amplitudes of three axes that are written as parts in phase.
+
+    Signed components of alternating fields change sign with pose and tone, and noise leaves no
+    part out of phase at zero. `frequency_hz`: of each channel, 0 of a level.
+    """
+    alternating = np.asarray(frequency_hz) > 0.0
+    if fields.axes != "xyz" or not fields.signed or len(fields) < LEAST_ROWS:
+        return
+    phasor = fields.phasor_sensor[:, alternating].reshape(len(fields), -1)
+    measured = phasor[:, np.isfinite(phasor).any(axis=0)]
+    unsigned = (measured.real >= 0.0) & (measured.imag == 0.0) | np.isnan(measured)
+    if measured.shape[1] >= LEAST_SERIES and unsigned.all():
+        raise InputError(
+            f"{place}: the components of three axes are never negative and have no part out of"
+            " phase, so they are amplitudes, which are for receivers of one axis; give re and im"
+            " with their signs."
+        )
 
 
 def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:

@@ -21,7 +21,6 @@ from magfusion.files.inertial_tables import (
     write_waveform,
 )
 from magfusion.files.log_header import HEADER, has_header, is_log, read_header
-from magfusion.files.lost_rows import copies_findings
 from magfusion.files.marks_table import read_marks, write_marks
 from magfusion.files.named_samples import names_magnetometers, read_waveforms, write_waveforms
 from magfusion.files.readings_table import (
@@ -106,8 +105,9 @@ def read_log(
         waveform = replace(waveform, marks=marks)
     if marks is not None:
         waveforms = {name: replace(wave, marks=marks) for name, wave in waveforms.items()}
-    copies: list[str] = []
-    truth = read_if_there(tables["truth"], partial(_read_truth, copies), span)
+    of_truth: list[Finding] = []
+    read_truth = partial(_read_truth, noticed=of_truth)
+    truth = read_if_there(tables["truth"], read_truth, span)
     log = Log(
         name=header.name,
         epoch_ns=header.epoch_ns,
@@ -116,7 +116,7 @@ def read_log(
         waveform=waveform,
         fields=read_if_there(tables["fields"], read_fields, span),
         truth=truth,
-        noticed=(*of_imu, *of_waveform, *copies_findings(copies), *lost_finding(header.audio)),
+        noticed=(*of_imu, *of_waveform, *of_truth, *lost_finding(header.audio)),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
         reference=read_waveform(tables["reference"], span)[0],
@@ -184,5 +184,5 @@ def _keep_others(former: Path, directory: Path) -> None:
             shutil.copy2(entry, directory / entry.name)
 
 
-def _read_truth(copies: list[str], path: Path, span: Span) -> Trajectory:
-    return read_trajectory(path, span.epoch_ns, span.start, span.end, remarks=copies)
+def _read_truth(path: Path, span: Span, noticed: list[Finding]) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end, noticed=noticed)

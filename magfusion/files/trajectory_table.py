@@ -7,10 +7,11 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from magfusion.files.lost_rows import copied_rows, copies_text
+from magfusion.files.lost_rows import copied_rows, copies_findings, copies_text
+from magfusion.files.pose_rows import QUATERNION_TOLERANCE, PoseRows
 from magfusion.files.table import TIME, TWICE, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import StateTrust
+from magfusion.model.trust import Finding, StateTrust
 from magfusion.units import Array, IntArray
 
 _POSITION = ("position_x", "position_y", "position_z")
@@ -25,7 +26,7 @@ _LAYOUT = TableLayout(
     some=(*_POSITION, *QUATERNION),
     optional=(_POSITION, QUATERNION, _VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV),
 )
-QUATERNION_TOLERANCE = 1e-3  # of its length from one
+_UNIT_LENGTH = "the length of a rotation's quaternion is 1: scale it"
 
 
 def write_trajectory(
@@ -80,18 +81,19 @@ def read_trajectory(
     start: float | None = None,
     end: float | None = None,
     content: pa.Table | None = None,
-    remarks: list[str] | None = None,
+    noticed: list[Finding] | None = None,
 ) -> Trajectory:
     """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
 
     A truth may have positions alone or attitudes alone; the other part is NaN then.
 
-    ``content`` as in `read_table`. ``remarks`` as in `magfusion.files.tum.read_tum`.
+    ``content`` as in `read_table`. `noticed`: receives the number of rows without a pose, or that
+    are copies of others, which are left out; without it they are refused.
     """
-    layout = _LAYOUT._replace(repeats=remarks is not None)
+    layout = _LAYOUT._replace(repeats=noticed is not None)
     table = read_table(path, layout, Span(epoch_ns, start, end), content)
-    if remarks is not None:
-        table = _without_copies(table, remarks)
+    if noticed is not None:
+        table = _with_poses(_without_copies(table, noticed), noticed)
     rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)
     if table.has(QUATERNION):
         rotation = unit_rotation(table).as_matrix()
@@ -107,7 +109,7 @@ def read_trajectory(
     )
 
 
-def _without_copies(table: Table, remarks: list[str]) -> Table:
+def _without_copies(table: Table, noticed: list[Finding]) -> Table:
     """Return a table without rows that were written twice; refuse others of one time."""
     names = [name for name in table.data.column_names if name != TIME]
     copies = copied_rows(table.time_ns, table.numbers(names, nan=True))
@@ -115,7 +117,7 @@ def _without_copies(table: Table, remarks: list[str]) -> Table:
     table.refuse(twice, TIME, table.time_ns, TWICE)
     if not copies.any():
         return table
-    remarks.append(copies_text(str(table.path), copies))
+    noticed += copies_findings([copies_text(str(table.path), copies)])
     once = ~copies
     data = table.data.filter(pa.array(once))
     return replace(table, data=data, time_ns=table.time_ns[once], time=table.time[once])
@@ -126,9 +128,31 @@ def unit_rotation(table: Table) -> Rotation:
     quaternion = table.numbers(QUATERNION)
     length = np.linalg.norm(quaternion, axis=1)
     off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-    remedy = "the length of a rotation's quaternion is 1: scale it"
-    table.refuse(off, "qw to qz", length, remedy)
+    table.refuse(off, "qw to qz", length, _UNIT_LENGTH)
     return Rotation.from_quat(quaternion, scalar_first=True)
+
+
+def _with_poses(table: Table, noticed: list[Finding]) -> Table:
+    """Return the rows of a table that have a pose, with quaternions of unit length."""
+    names = _POSITION if table.has(_POSITION) else ()
+    quaternion = table.numbers(QUATERNION, nan=True) if table.has(QUATERNION) else None
+    poses = PoseRows.of(table.numbers(names, nan=True), quaternion)
+    table.refuse(poses.refused, "qw to qz", poses.length, _UNIT_LENGTH)
+    noticed += poses.findings("truth" if table.path.stem in ("truth", "data") else table.path.name)
+    data = table.data
+    quaternions = () if poses.quaternion is None else poses.quaternion.T
+    for name, values in zip(QUATERNION, quaternions, strict=False):
+        data = data.set_column(data.column_names.index(name), name, pa.array(values.copy()))
+    stamps, omitted = table.time_ns, np.flatnonzero(~poses.kept)
+    return replace(
+        table,
+        data=data.filter(pa.array(poses.kept)),
+        time_ns=stamps[poses.kept],
+        time=table.time[poses.kept],
+        stray=tuple(
+            zip((table.first_row + omitted).tolist(), stamps[omitted].tolist(), strict=True)
+        ),
+    )
 
 
 def _numbers(table: Table, names: tuple[str, ...]) -> Array | None:

@@ -11,15 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
-from magfusion.files.lost_rows import copied_rows, copies_text
+from magfusion.files.lost_rows import copied_rows, copies_findings, copies_text
+from magfusion.files.pose_rows import PoseRows
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
-from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NS_PER_S
 
+# Exponents of ten of a second; a stamp beyond the year 2100 in seconds is in a smaller unit.
+TIME_UNITS = {"s": 0, "ms": -3, "us": -6, "ns": -9}
+_LATEST_S = 4.1e9
 _COLUMNS = "time_s x y z qx qy qz qw"
 _POSITIONS = "time_s x y z"
-_EIGHT = f"eight finite numbers: {_COLUMNS}"
+_EIGHT = f"eight numbers: {_COLUMNS}"
 
 
 def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
@@ -37,32 +41,51 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
             stream.write(" ".join([time, *(f"{value:.9f}" for value in pose)]) + "\n")
 
 
-def read_tum(path: Path, epoch_ns: int = 0, remarks: list[str] | None = None) -> Trajectory:
+def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
-    Attitudes of a file with positions alone are NaN. `remarks`: if given, lines that were written
-    twice are left out and counted there. Raises InputError where the file is absent,
-    not text, empty, a line does not hold eight finite numbers (or four, of positions alone: as many
-    as the first line), a quaternion is not of unit length, or the times do not increase.
+    Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
+    not text, empty, a line does not hold eight numbers (or four, of positions alone: as many as the
+    first line), no line or too few a pose, or the times do not increase. `noticed`: receives the
+    number of lines without a pose, or that were written twice, which are left out; without it they
+    are refused.
     """
     lines = _lines(path)
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
-    values = np.array([_numbers(path, number, text, count) for number, text in lines])
-    stamps = np.array([_stamp(path, number, text) for number, text in lines], dtype=np.int64)
-    if remarks is not None and (copies := copied_rows(stamps, values)).any():
-        remarks.append(copies_text(str(path), copies))
+    numbers = np.array([_numbers(path, number, text, count) for number, text in lines])
+    values, unit = numbers[:, 1:], tum_time_unit(np.max(np.abs(numbers[:, 0])))
+    stamps = np.array([_stamp(path, number, text, unit) for number, text in lines], dtype=np.int64)
+    if noticed is not None and (copies := copied_rows(stamps, values)).any():
+        noticed += copies_findings([copies_text(str(path), copies)])
         lines = [line for line, copy in zip(lines, copies, strict=True) if not copy]
         values, stamps = values[~copies], stamps[~copies]
     time = Span(epoch_ns).seconds(stamps)
     for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
         _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")
-    if count == 4:
-        return Trajectory(time, np.full((len(time), 3, 3), np.nan), values)
-    length = np.linalg.norm(values[:, 3:], axis=1)
-    for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
-        _refuse(path, lines[k][0], f"a quaternion of length {length[k]:.6g}", "one of length 1")
-    rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
-    return Trajectory(time, rotation, values[:, :3])
+    poses = PoseRows.of(values[:, :3], None if count == 4 else values[:, 3:])
+    for k in np.flatnonzero(poses.refused)[:1]:
+        result = f"a quaternion of length {poses.length[k]:.6g}"
+        _refuse(path, lines[k][0], result, "one of length 1")
+    for k in np.flatnonzero(~poses.kept & (noticed is None))[:1]:
+        _refuse(path, lines[k][0], repr(lines[k][1][:60]), "a pose")
+    if not poses.kept.any():
+        raise InputError(f"{path}: none of its {len(lines)} lines has a pose; record it again.")
+    if noticed is not None:
+        if unit != "s":
+            text = f"{path.name}: its times are read as {unit}; in s they are no dates."
+            noticed.append(Finding("stamp_resolution", text, Verdict.TRUSTWORTHY))
+        noticed += poses.findings(path.name)
+    time, position = time[poses.kept], values[poses.kept, :3]
+    if poses.quaternion is None:
+        return Trajectory(time, np.full((len(time), 3, 3), np.nan), position)
+    rotation = Rotation.from_quat(poses.quaternion[poses.kept]).as_matrix()
+    return Trajectory(time, rotation, position)
+
+
+def tum_time_unit(largest: float) -> str:
+    """Return the unit in which the largest stamp of a file is no date beyond 2100; else s."""
+    fitting = [name for name, power in TIME_UNITS.items() if largest * 10.0**power < _LATEST_S]
+    return fitting[0] if fitting else "s"
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -80,20 +103,20 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
-    """Return position and quaternion."""
+    """Return time, position and quaternion; NaN for what is not finite."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not (np.abs(values) < LARGEST_NUMBER).all():
-        wanted = f"four finite numbers: {_POSITIONS}" if count == 4 else _EIGHT
+    if len(values) != count or not abs(values[0]) < LARGEST_NUMBER:
+        wanted = f"four numbers: {_POSITIONS}" if count == 4 else _EIGHT
         _refuse(path, number, repr(text[:60]), wanted)
-    return values[1:]
+    return [value if abs(value) < LARGEST_NUMBER else np.nan for value in values]
 
 
-def _stamp(path: Path, number: int, text: str) -> int:
+def _stamp(path: Path, number: int, text: str, unit: str) -> int:
     try:
-        stamp = round(Decimal(text.split()[0]) * NS_PER_S)
+        stamp = round(Decimal(text.split()[0]).scaleb(TIME_UNITS[unit]) * NS_PER_S)
     except InvalidOperation:
         stamp = LARGEST_TIME_NS + 1
     if abs(stamp) > LARGEST_TIME_NS:

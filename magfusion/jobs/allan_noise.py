@@ -12,7 +12,8 @@ from magfusion.errors import InputError
 from magfusion.estimation.data_checks.pauses import repeated_samples
 from magfusion.estimation.data_checks.samples import clipped_samples, false_samples, frozen_samples
 from magfusion.estimation.data_checks.stamps import uneven_stamps
-from magfusion.files.table_stream import SampleBlock, pieces
+from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.table_stream import STREAMS, SampleBlock, pieces
 from magfusion.jobs.inputs import Job
 from magfusion.model.progress import Report
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -161,18 +162,41 @@ def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
 def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _StreamFindings]:
     """Return the samples of a stream at rest, and the findings of its blocks.
 
-    Raises InputError where there are too few samples.
+    Raises InputError where there are too few samples, or they are in another unit.
     """
     rest, findings = RestStream(width), _StreamFindings()
+    rows, present = 0, np.zeros(width, dtype=np.int64)
     for piece in _pieces(job, stream):
+        if not rows:
+            _check_units(stream, piece, str(job.log_path))
+        rows, present = rows + len(piece.time), present + np.isfinite(piece.values).sum(axis=0)
         rest.add(piece.time, piece.values)
         findings.add(_of_piece(stream, piece))
     if findings.pieces and len(rest) < LEAST_SAMPLES:
+        names = [STREAMS[stream].numbers[k] for k in np.flatnonzero(present == 0)]
+        if names:
+            raise InputError(
+                f"{job.log_path}: {', '.join(names)} {'is' if len(names) == 1 else 'are'} NaN in"
+                f" all {rows} rows of {stream}; repair the sensor or its recording"
+            )
         raise InputError(
             f"{job.log_path}: {stream} has {len(rest)} samples in the selected part; record at rest"
             " for at least some minutes, better for hours"
         )
     return rest, findings
+
+
+def _check_units(stream: str, piece: SampleBlock, place: str) -> None:
+    """Refuse samples in another unit; of a half alone the other one is at rest."""
+    known = np.isfinite(piece.values).all(axis=1)
+    time, values = piece.time[known], piece.values[known]
+    if stream == "magnetometer":
+        check_field(np.linalg.norm(values, axis=1), place)
+    elif len(time):
+        gyro = np.zeros((len(time), 3)) if stream == "accel" else values[:, :3]
+        weight = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
+        accel = weight if stream == "gyro" else values[:, -3:]
+        check_imu(ImuSamples(time, gyro, accel), place)
 
 
 def _pieces(job: Job, stream: str) -> Iterator[SampleBlock]:

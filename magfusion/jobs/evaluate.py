@@ -12,9 +12,10 @@ from magfusion.files.open import open_log
 from magfusion.files.site_draft import numbers
 from magfusion.jobs.settings import Command, TopicSettings, argument, option
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
 from magfusion.results.association import associate
 from magfusion.results.figures import Figure, Figures, Section
-from magfusion.results.truth_frame import frame_remarks
+from magfusion.results.truth_frame import frame_remarks, unit_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,24 +59,31 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.results.errors import trajectory_errors
     from magfusion.results.report import error_figures
 
-    true, epoch_ns, remarks = _read_truth(settings)
-    result = _read_estimate(settings, epoch_ns, remarks)
+    noticed: list[Finding] = []
+    true, epoch_ns, remarks = _read_truth(settings, noticed)
+    result = _read_estimate(settings, epoch_ns, noticed)
     with named(f"{settings.estimate} against {settings.truth}"):
         result, aligned = _aligned(settings, result, true)
+        pairs = associate(result, true)
+        # In a smaller unit no step is small enough for an interpolation to millimetres.
+        unit = unit_text(associate(result, true, any_motion=True))
+        if unit and len(pairs.truth) < 3:
+            raise InputError(unit)
         errors = error_figures(trajectory_errors(result, true))
-        remarks = [*remarks, *frame_remarks(associate(result, true))]
+        frames = [*remarks, unit] if unit else frame_remarks(pairs, remarks)
+    remarks = [*(finding.text for finding in noticed), *frames]
     notes = Figures(*[Figure("notes", remarks, section=Section.NOTES)] * bool(remarks))
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | aligned | notes
 
 
-def _read_estimate(settings: EvaluateSettings, epoch_ns: int, remarks: list[str]) -> Trajectory:
+def _read_estimate(settings: EvaluateSettings, epoch_ns: int, noticed: list[Finding]) -> Trajectory:
     """Return the poses of the frame that the truth tracks."""
     from magfusion.jobs.inputs import read_any_poses
     from magfusion.results.alignment import tracked_point
 
     lever = numbers("--lever-arm", settings.lever_arm, (3,))
     mounting = numbers("--mounting", settings.mounting, (3,))
-    estimate = read_any_poses(settings.estimate, epoch_ns, remarks)
+    estimate = read_any_poses(settings.estimate, epoch_ns, noticed)
     if not any((*lever, *mounting)):
         return estimate
     if not estimate.has_attitude:
@@ -107,7 +115,9 @@ def _aligned(
     return estimate, figures
 
 
-def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int, list[str]]:
+def _read_truth(
+    settings: EvaluateSettings, noticed: list[Finding]
+) -> tuple[Trajectory, int, list[str]]:
     """Return the truth, the zero of its clock (ns), and what contradicts it in its log."""
     from magfusion.estimation.data_checks.truth import truth_findings
     from magfusion.jobs.inputs import read_any_poses, topics_option
@@ -117,16 +127,15 @@ def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int, list[str]]
     is_result = (path / "trajectory.parquet").is_file()
     ned = settings.truth_axes == "ned"
     if is_result or not (path.is_dir() or is_bag(path)):
-        remarks: list[str] = []
-        poses = read_any_poses(path, remarks=remarks)
-        return from_ned(poses) if ned else poses, 0, remarks
+        poses = read_any_poses(path, noticed=noticed)
+        return from_ned(poses) if ned else poses, 0, []
     log = open_log(path, topics=topics)
     if log.truth is None:
         raise InputError(f"{path}: has no truth; give a log with truth, a TUM file or a table")
     poses = from_ned(log.truth) if ned else log.truth
+    noticed += [one for one in log.noticed if "truth" in one.text.partition(": ")[0]]
     findings = truth_findings(replace(log, truth=poses))
-    of_truth = [one.text for one in log.noticed if "truth" in one.text.partition(": ")[0]]
-    return poses, log.epoch_ns, [*of_truth, *(finding.text for finding in findings)]
+    return poses, log.epoch_ns, [finding.text for finding in findings]
 
 
 COMMAND = Command(EvaluateSettings, run_evaluate, example="magfusion evaluate run log")

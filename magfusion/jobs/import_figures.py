@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from magfusion.files.foreign.columns import FIELDS
 from magfusion.files.foreign.convert import Counts
 from magfusion.files.foreign.halves import HALVES
-from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
+from magfusion.files.pose_rows import QUATERNION_TOLERANCE, scaled_text
 from magfusion.results.figures import Figure, Figures, Section
 from magfusion.units import NANOSECOND
 
@@ -69,7 +69,7 @@ def import_figures(
         if one.wrapped
     ]
     notes += [
-        f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."
+        scaled_text(stream, one.scaled)
         for stream, one in counts.items()
         if one.scaled > QUATERNION_TOLERANCE
     ]

@@ -15,9 +15,11 @@ from magfusion.estimation.demodulation.separate_demodulation import demodulated_
 from magfusion.estimation.demodulation.temperature_compensation import at_reference
 from magfusion.estimation.measurements.signs import along_axis
 from magfusion.files.bag_topics import Topics
+from magfusion.files.drive_columns import column_names
 from magfusion.files.fields import order_channels
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
+from magfusion.files.table import TIME
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
 from magfusion.jobs.receiver_axes import check_axes
@@ -274,15 +276,23 @@ def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
     return poses
 
 
-def read_any_poses(path: Path, epoch_ns: int = 0, remarks: list[str] | None = None) -> Trajectory:
+def read_any_poses(
+    path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
+) -> Trajectory:
     """Read a trajectory as `read_estimate`, which may have positions or attitudes alone.
 
-    `remarks`: as in `magfusion.files.tum.read_tum`.
+    `noticed`: receives the number of rows without a pose, which are left out; without it they are
+    refused.
     """
     if path.is_dir():
         if not (path / "trajectory.parquet").is_file():
             raise InputError(f"{path}: has no trajectory.parquet; give the result of a job")
         return read_trajectory(path / "trajectory.parquet", epoch_ns)
     if path.suffix in (".parquet", ".csv"):
-        return read_trajectory(path, epoch_ns, remarks=remarks)
-    return read_tum(path, epoch_ns, remarks)
+        names = column_names(path)
+        if names and TIME not in names:
+            from magfusion.files.foreign.euroc import read_euroc_poses  # slow, and seldom needed
+
+            return read_euroc_poses(path, epoch_ns, noticed)
+        return read_trajectory(path, epoch_ns, noticed=noticed)
+    return read_tum(path, epoch_ns, noticed)

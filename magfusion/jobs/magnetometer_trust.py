@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.calibration.magnetometer import field_from_measured, refined
+from magfusion.errors import EstimationError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.data_checks.samples import clipped_samples
+from magfusion.estimation.data_checks.turn_witness import left_handed_field
 from magfusion.estimation.snapshot.priors import Contradiction, contradiction, trust_of
 from magfusion.model.samples import Log
 from magfusion.model.site import Magnetometer, Site
@@ -69,11 +72,25 @@ def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCal
     from magfusion.calibration.magnetometer_size import calibrate_alone
 
     assert log.waveform is not None
-    if log.inertial:
-        result = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
-    else:
-        result = calibrate_alone(log.waveform, site)
+    try:
+        if log.inertial:
+            result = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
+        else:
+            result = calibrate_alone(log.waveform, site)
+    except EstimationError as failure:
+        cause = next(_failure_causes(log, site), None)
+        if cause is None:
+            raise
+        raise EstimationError(cause.text.rstrip(".")) from failure
     return judge_calibration(result, site, log)
+
+
+def _failure_causes(log: Log, site: Site) -> Iterator[Finding]:
+    """Yield what spoils the readings of a calibration that finds no solution."""
+    yield from (one for one in clipped_samples(log, site) if one.text.startswith("magnetometer"))
+    left_handed = left_handed_field(log, site) if log.inertial else None
+    if left_handed is not None:
+        yield left_handed
 
 
 def judge_calibration(
@@ -100,7 +117,7 @@ def judge_calibration(
     platform = replace(site.platform, magnetometer=calibration.magnetometer)
     streams = recorded(log, replace(site, platform=platform), BRIDGED_CODES)
     return calibration, trust | Trust(
-        (*_doubts(calibration, site), *_remarks(calibration, log), *streams)
+        (*_doubts(calibration, site, log), *_remarks(calibration, log), *streams)
     )
 
 
@@ -118,8 +135,8 @@ def _declared_difference(calibration: LogCalibration) -> Contradiction:
     return contradiction(names, change, cov, cov, remedy, "The other estimated parameters")
 
 
-def _doubts(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
-    yield from _of_another_scale(calibration, site)
+def _doubts(calibration: LogCalibration, site: Site, log: Log) -> Iterator[Finding]:
+    yield from _of_another_scale(calibration, site, log)
     if calibration.rival is not None:
         own, other = (_microtesla(b) for b in (calibration.magnetometer.offset, calibration.rival))
         yield Finding(
@@ -154,7 +171,7 @@ def _microtesla(offset: Array) -> str:
     return "[" + ", ".join(f"{1e6 * axis:.1f}" for axis in offset) + "]"
 
 
-def _of_another_scale(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
+def _of_another_scale(calibration: LogCalibration, site: Site, log: Log) -> Iterator[Finding]:
     """Yield a finding if only another scale of the sensor matches the declared field.
 
     It precedes findings of the calibration against its prior, of which it is the cause.
@@ -169,7 +186,11 @@ def _of_another_scale(calibration: LogCalibration, site: Site) -> Iterator[Findi
         f"The estimated scale of the magnetometer is {ratio:.3g} times the declared one: the"
         " readings have another unit, or the site's Earth field has another magnitude."
     )
-    if site.earth_field_world is not None and abs(ratio - 1.0) < 1.0:
+    if ratio < 0.0 and log.inertial and (reversed_axes := left_handed_field(log, site)):
+        text = reversed_axes.text
+    elif ratio < 0.0:
+        text = "The signs of all axes of the magnetometer are reversed. Correct the driver."
+    elif site.earth_field_world is not None and abs(ratio - 1.0) < 1.0:
         size = 1e6 * float(np.linalg.norm(site.earth_field_world))
         text = (
             f"With the declared calibration the readings are of a field of {ratio * size:.3g} uT,"

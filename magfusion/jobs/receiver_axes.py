@@ -3,7 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from magfusion.errors import InputError
+from magfusion.files.fields import refuse_unsigned
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 
@@ -13,6 +16,10 @@ def check_axes(
 ) -> None:
     """Reject components other than those of the site's receiver, or unsupported by a job."""
     sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
+    if fields is not None:
+        known = dict(zip(site.channels, site.tone_frequencies_hz, strict=True))
+        frequencies = np.array([known.get(channel, 0.0) for channel in fields.channels])
+        refuse_unsigned(fields, frequencies, log_path)
     measured = {stream.axes for stream in (fields, wave) if stream is not None}
     amplitude = fields is not None and not fields.signed
     if measured <= {"xyz"} and sensor.axes == "xyz" and not amplitude:

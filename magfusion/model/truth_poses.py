@@ -96,8 +96,8 @@ def _reason(truth: Trajectory, time: Array, inside: BoolArray, covered: BoolArra
     parts = []
     if not np.all(inside):
         parts.append(
-            f"{np.sum(~inside)} are outside of its {truth.time[0]:.6g} to {truth.time[-1]:.6g} s"
-            f" (the estimate: {time[0]:.6g} to {time[-1]:.6g} s)"
+            f"{np.sum(~inside)} are outside of its {_shown(truth.time)} s (the estimate:"
+            f" {_shown(time)} s)"
         )
     if np.any(inside & ~covered):
         longest = float(np.max(np.diff(truth.time), initial=0.0))
@@ -107,6 +107,11 @@ def _reason(truth: Trajectory, time: Array, inside: BoolArray, covered: BoolArra
             f" {MAX_ROTATION_ERROR / DEGREE:.1g} deg"
         )
     return " and ".join(parts)
+
+
+def _shown(time: Array) -> str:
+    """Return first and last of times to the millisecond: dates have ten digits before it."""
+    return " to ".join(f"{t:.3f}".rstrip("0").rstrip(".") for t in (time[0], time[-1]))
 
 
 def _cubic(truth: Trajectory, time: Array) -> Trajectory:

@@ -27,13 +27,15 @@ class AssociatedPoses:
         return replace(self, estimate=own, truth=true)
 
 
-def associate(estimate: Trajectory, truth: Trajectory) -> AssociatedPoses:
+def associate(
+    estimate: Trajectory, truth: Trajectory, *, any_motion: bool = False
+) -> AssociatedPoses:
     """Return the truth at the estimate's epochs, wherever its motion allows that.
 
     Where it does not, and the truth is the coarser of both, the estimate at the truth's samples.
-    Neither is interpolated across its gaps.
+    Neither is interpolated across its gaps. `any_motion` as of `truth_poses`.
     """
-    true, covered, reason = truth_poses(truth, estimate.time)
+    true, covered, reason = truth_poses(truth, estimate.time, any_motion=any_motion)
     if _coarser(truth, estimate) and np.any(~covered & in_short_steps(truth, estimate.time)):
         within = (truth.time >= estimate.time[0]) & (truth.time <= estimate.time[-1])
         coarse = select_poses(truth, within)

@@ -1,9 +1,20 @@
-"""What a constant of the frames, or a standstill of the tracker, explains of a truth's errors."""
+"""What a constant of frames, clock or unit, or a standstill, explains of a truth's errors."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.data_checks.truth import LEAST_TURN, SPAN
+from magfusion.estimation.data_checks.truth import (
+    LEAST_DELAY,
+    LEAST_TURN,
+    MAX_DELAY,
+    SPAN,
+    attitude_spans,
+    quaternion_text,
+    rotation_changes,
+)
+from magfusion.results.alignment import MIN_RATE
 from magfusion.results.association import AssociatedPoses
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -18,9 +29,94 @@ FROZEN_SHARE = 0.01  # of the compared poses
 UP_FROM_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def frame_remarks(pairs: AssociatedPoses) -> list[str]:
-    """Return sentences on the frames of a truth, each with its remedy."""
-    return [text for text in (_frozen_text(pairs), _world_text(pairs), _body_text(pairs)) if text]
+# Lengths of other units (m), and how far from their ratio an estimate may be.
+UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "km": 1e3}
+UNIT_TOLERANCE = 0.1
+
+
+def frame_remarks(pairs: AssociatedPoses, inertial: Sequence[str] = ()) -> list[str]:
+    """Return sentences on frames and clock of a truth, each with its remedy.
+
+    `inertial`: how the truth contradicts the inertial samples of its log. They name a delay better
+    than the estimate does, which shows more of the rotation.
+    """
+    frozen = _frozen_text(pairs)
+    quaternion = "" if frozen else _quaternion_text(pairs)
+    others = [quaternion] if quaternion else list(inertial)
+    if not frozen and not others:
+        others = [_delay_text(pairs)]
+    return [text for text in (frozen, *others, _world_text(pairs), _body_text(pairs)) if text]
+
+
+def unit_text(pairs: AssociatedPoses) -> str:
+    """Return the unit of the truth's positions, where they are an estimate's times its ratio."""
+    own, true = pairs.estimate, pairs.truth
+    if not (own.has_position and true.has_position and len(true) > MIN_TURNS):
+        return ""
+    moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
+    length = np.linalg.norm(moved)
+    scale = np.linalg.norm(target) / max(float(length), 1e-12)
+    for unit, size in UNITS.items():
+        if abs(scale * size - 1.0) < UNIT_TOLERANCE:
+            off = _rotated(moved, size * target) - size * target
+            if np.linalg.norm(off) < EXPLAINED * length:
+                return (
+                    f"The truth's positions are {scale:.3g} times those of the estimate: they are"
+                    f" in {unit}. Import it with --map 'truth.position=NAMES[{unit}]'."
+                )
+    return ""
+
+
+def _is_flat(vectors: Array) -> bool:
+    """Return whether vectors (n, 3) are along a line, about which the roll is open."""
+    extent = np.linalg.svd(vectors, compute_uv=False)
+    return bool(extent[1] < MIN_FLATNESS * extent[0] or extent[1] == 0.0)
+
+
+def _rotated(moved: Array, target: Array) -> Array:
+    """Return one centred path (n, 3) rotated to fit another; as it is along a line."""
+    if _is_flat(moved) or _is_flat(target):
+        return moved
+    return np.asarray(Rotation.align_vectors(target, moved)[0].apply(moved))
+
+
+def _quaternion_text(pairs: AssociatedPoses) -> str:
+    """Return the order or the direction of the truth's quaternion that the estimate shows."""
+    own, true = pairs.estimate, pairs.truth
+    if not (own.has_attitude and true.has_attitude):
+        return ""
+    rows = attitude_spans(true.time)
+    text = quaternion_text(true.rotation, rows, rotation_changes(own.rotation, rows))
+    return f"The truth's {text.removeprefix('its ')}" if text else ""
+
+
+def _delay_text(pairs: AssociatedPoses) -> str:
+    """Return by how much the truth's clock is late, where errors are proportional to motion."""
+    own, true = pairs.estimate, pairs.truth
+    if len(true) <= MIN_TURNS:
+        return ""
+    error, speed = np.zeros((1, 3)), np.zeros((1, 3))
+    other = ""
+    if own.has_attitude and true.has_attitude:
+        ahead = np.arange(1, len(true))
+        step = rotation_changes(true.rotation, np.stack([ahead - 1, ahead], axis=1))
+        speed = step / np.diff(true.time)[:, None]
+        world = (own.rotation * true.rotation.inv()).mean()
+        off = (true.rotation.inv() * world.inv() * own.rotation).as_rotvec()
+        error = 0.5 * (off[1:] + off[:-1])
+    if np.std(speed) < MIN_RATE and own.has_position and true.has_position:
+        moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
+        error, speed = _rotated(moved, target) - target, np.gradient(target, true.time, axis=0)
+        other = ", or --lever-arm if it tracks a point ahead or behind"
+    error, speed = error - error.mean(axis=0), speed - speed.mean(axis=0)
+    delay = float(np.sum(error * speed)) / max(float(np.sum(speed**2)), 1e-12)
+    remaining = float(np.sum((error - delay * speed) ** 2))
+    if not LEAST_DELAY < abs(delay) < MAX_DELAY or remaining > EXPLAINED * np.sum(error**2):
+        return ""
+    return (
+        f"The truth's clock is about {1e3 * abs(delay):.0f} ms {'late' if delay > 0.0 else 'early'}"
+        f" against the estimate's: give --align-time{other}."
+    )
 
 
 def _frozen_text(pairs: AssociatedPoses) -> str:
@@ -73,8 +169,7 @@ def _world_turn(pairs: AssociatedPoses) -> Rotation | None:
     own, true = pairs.estimate, pairs.truth
     if own.has_position and true.has_position:
         moved, target = (p.position_world - p.position_world.mean(axis=0) for p in (own, true))
-        extent = np.linalg.svd(moved, compute_uv=False)
-        if extent[1] < MIN_FLATNESS * extent[0] or extent[1] == 0.0:
+        if _is_flat(moved) or _is_flat(target):
             return None
         turn, residual = Rotation.align_vectors(target, moved)
         return turn if residual < EXPLAINED * np.linalg.norm(target - moved) else None
@@ -116,8 +211,7 @@ def _body_turn(pairs: AssociatedPoses) -> Rotation | None:
         (p.rotation[:-step].inv() * p.rotation[step:]).as_rotvec() for p in (own, true)
     )
     active = np.linalg.norm(moved, axis=1) > LEAST_TURN
-    extent = np.linalg.svd(moved[active], compute_uv=False) if active.any() else np.zeros(3)
-    if np.sum(active) < MIN_TURNS or extent[1] < MIN_FLATNESS * extent[0]:
+    if np.sum(active) < MIN_TURNS or _is_flat(moved[active]) or _is_flat(target[active]):
         return None
     body, residual = Rotation.align_vectors(moved[active], target[active])
     return body if residual < EXPLAINED * np.linalg.norm(target[active]) else None

@@ -28,6 +28,7 @@ from magfusion.units import Array, BoolArray, IntArray
 CHANCE = 1e-7  # probability of a false alarm per stream
 SHORTEST_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch is missed
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
+WHOLE = 0.99  # of the log, of which nothing remains to use
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
 LEAST_WRAPS = 2
@@ -147,11 +148,13 @@ def _freeze(stream: InstrumentStream, where: str, result: Runs) -> Finding:
     hung = "frozen_magnetometer" if stream.name == "magnetometer" else "frozen_imu"
     code = "stuck_axis" if dead or where != "all axes" else hung
     cause = "it is dead or not connected" if dead else "the sensor or its driver hung"
+    remedy = "Exclude that part by --start and --end, or repair the sensor."
+    if share > WHOLE:
+        remedy = "Repair the sensor or its connection, and record again."
     return Finding(
         code,
         f"{stream.name}: {where} frozen{value} from {begin[longest]:.2f} to"
-        f" {end[longest]:.2f} s{more}, {100.0 * share:.0f} % of the log: {cause}. Exclude that part"
-        " by --start and --end, or repair the sensor.",
+        f" {end[longest]:.2f} s{more}, {100.0 * share:.0f} % of the log: {cause}. {remedy}",
         verdict,
         3e3 + share,
     )

@@ -27,14 +27,19 @@ MAX_TILT = 5.0 * DEGREE  # of the mean specific force; accelerometers and motion
 DOWN = 150.0 * DEGREE
 DOWN_AXES = np.diag([1.0, -1.0, -1.0])
 CONVENTION = 15.0 * DEGREE  # from the axes of a convention
+BODY_DOWN = "its body axes are forward, right, down (as with NED). Turn them to z up."
+NED = (
+    "its world is north, east, down and its body forward, right, down (NED). Turn both to z up, or"
+    " evaluate with --truth-axes ned."
+)
 MAX_DELAY, DELAY_STEP = 1.0, 0.01  # s; searched either way, and in steps
 LEAST_DELAY = 0.03  # s; filters of gyroscopes delay by less
 EXPLAINED = 0.5  # of the squared errors that a delay leaves
 MIN_CORRELATION = 0.8  # of accelerations along the axis of least motion; noise has none
 # The components w, x, y, z that are meant, by their places among those that were read.
 ORDERS = {
-    "w, x, y, z read as x, y, z, w": (1, 2, 3, 0),
-    "x, y, z, w read as w, x, y, z": (3, 0, 1, 2),
+    "w, x, y, z read as x, y, z, w": ((1, 2, 3, 0), "wxyz"),
+    "x, y, z, w read as w, x, y, z": ((3, 0, 1, 2), "xyzw"),
 }
 
 
@@ -47,15 +52,17 @@ def truth_findings(log: Log) -> Iterator[Finding]:
     before, later = log.imu.time[after - 1], log.imu.time[after]
     inside = (truth.time >= before) & (truth.time <= later) & (later - before < MAX_IMU_STEP)
     poses = _rows(truth, np.flatnonzero(inside))
-    rows = _spans(poses.time)
+    rows = attitude_spans(poses.time)
     turn = attitude_from_gyro_at(log.imu.time, log.imu.gyro_body, poses.time)
+    text = ""
     if len(rows) >= MIN_SPANS:
         gyro = (turn[rows[:, 0]].inv() * turn[rows[:, 1]]).as_rotvec()
         text = _delay_text(log, poses, rows) or _rotation_text(poses.rotation, rows, gyro)
-        if text:
-            yield _finding(text)
-            return
-    text = _gravity_text(log, poses) or _mirrored_text(log, poses, rows)
+    text = text or _gravity_text(log, poses) or _mirrored_text(log, poses, rows)
+    if text == BODY_DOWN and _tilt(log, _z_up(poses)) > DOWN:
+        text = NED
+    if text and np.array_equal(truth.world_from_body, np.tile(np.eye(3), (len(truth), 1, 1))):
+        text = "it never rotates, so it is a truth of positions alone. Omit its quaternion."
     if text:
         yield _finding(text)
 
@@ -73,7 +80,7 @@ def _rows(truth: Trajectory, rows: IntArray) -> Trajectory:
     return Trajectory(truth.time[rows], truth.world_from_body[rows], truth.position_world[rows])
 
 
-def _spans(time: Array) -> IntArray:
+def attitude_spans(time: Array) -> IntArray:
     """Return pairs of samples about `SPAN` apart, shape (m, 2)."""
     after = np.searchsorted(time, time + SPAN)
     first = np.flatnonzero(after < len(time))
@@ -90,7 +97,7 @@ def _delay_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     if len(rows) < MIN_SPANS or end[-1] - begin[0] < MIN_SPANS * SPAN:
         return ""
     angle = cumulative_trapezoid(gyro, time, axis=0, initial=0.0)
-    change = _changes(truth.rotation, rows)
+    change = rotation_changes(truth.rotation, rows)
     delays = np.arange(-MAX_DELAY, MAX_DELAY + 0.5 * DELAY_STEP, DELAY_STEP)
     errors = np.empty(len(delays))
     for k, delay in enumerate(delays):
@@ -157,7 +164,7 @@ def _rotation_text(attitude: Rotation, rows: IntArray, gyro: Array) -> str:
     if np.sum(active) < MIN_SPANS:
         return ""
     rows, gyro, size = rows[active], gyro[active], size[active]
-    change = _changes(attitude, rows)
+    change = rotation_changes(attitude, rows)
     still = np.linalg.norm(change, axis=1) < FROZEN * size
     if np.mean(still) > FROZEN_SHARE:
         return (
@@ -175,14 +182,9 @@ def _rotation_text(attitude: Rotation, rows: IntArray, gyro: Array) -> str:
 
 def _cause(attitude: Rotation, rows: IntArray, gyro: Array, change: Array) -> str:
     """Return the convention that makes rotations of the truth those of the gyroscope."""
-    for name, places in ORDERS.items():
-        meant = Rotation.from_quat(
-            attitude.as_quat(scalar_first=True)[:, places], scalar_first=True
-        )
-        if _agrees(_changes(meant, rows), gyro):
-            return f"its quaternion is in another order: {name}. Give the order, e.g. by --map."
-    if _agrees(_changes(attitude.inv(), rows), gyro):
-        return "its attitudes are body_from_world. Invert them."
+    convention = quaternion_text(attitude, rows, gyro)
+    if convention:
+        return convention
     columns, _, rows_t = np.linalg.svd(change.T @ gyro)
     body = columns @ np.diag([1.0, 1.0, np.linalg.det(columns @ rows_t)]) @ rows_t
     if not _agrees(change @ body, gyro):
@@ -190,14 +192,42 @@ def _cause(attitude: Rotation, rows: IntArray, gyro: Array, change: Array) -> st
     angle = float(Rotation.from_matrix(body).magnitude()) / DEGREE
     from_down = Rotation.from_matrix(body @ DOWN_AXES).magnitude()
     if from_down < CONVENTION:
-        return "its body axes are forward, right, down (as with NED). Turn them to z up."
+        return BODY_DOWN
     return (
         f"its body axes are turned against the IMU's by {angle:.0f} deg. Turn its attitudes"
         " into the axes of the IMU."
     )
 
 
-def _changes(attitude: Rotation, rows: IntArray) -> Array:
+def quaternion_text(attitude: Rotation, rows: IntArray, rotations: Array) -> str:
+    """Return the order or the direction of its quaternion in which a truth turns as others do.
+
+    `rows`: pairs of its samples, shape (m, 2). `rotations`: rotation vectors between them in body
+    axes, of a gyroscope or an estimate, shape (m, 3) (rad).
+    """
+    size = np.linalg.norm(rotations, axis=1)
+    active = (size > LEAST_TURN) & (size < 0.5 * np.pi)
+    rows, rotations = rows[active], rotations[active]
+    if len(rows) < MIN_SPANS or _agrees(rotation_changes(attitude, rows), rotations):
+        return ""
+    for name, (places, order) in ORDERS.items():
+        meant = Rotation.from_quat(
+            attitude.as_quat(scalar_first=True)[:, places], scalar_first=True
+        )
+        if _agrees(rotation_changes(meant, rows), rotations):
+            return (
+                f"its quaternion is in another order: {name}. Import it with --map"
+                f" 'truth.quaternion=NAMES[{order}]'."
+            )
+    if _agrees(rotation_changes(attitude.inv(), rows), rotations):
+        return (
+            "its attitudes are body_from_world. Import it with inverted signs: --map"
+            " 'truth.quaternion=-QX,-QY,-QZ,QW[xyzw]', with the names of its columns."
+        )
+    return ""
+
+
+def rotation_changes(attitude: Rotation, rows: IntArray) -> Array:
     """Return rotation vectors over spans in body axes, shape (m, 3) (rad)."""
     return np.asarray((attitude[rows[:, 0]].inv() * attitude[rows[:, 1]]).as_rotvec())
 
@@ -211,15 +241,27 @@ def _gravity_text(log: Log, truth: Trajectory) -> str:
     """Return how the mean specific force in the truth's world differs from the vertical."""
     if len(truth) < MIN_SPANS or truth.time[-1] - truth.time[0] < MIN_SPANS * SPAN:
         return ""
-    imu = log.imu
-    force = [np.interp(truth.time, imu.time, axis) for axis in imu.accel_body.T]
-    mean = np.mean(truth.rotation.apply(np.stack(force, axis=1)), axis=0)
-    tilt = float(np.arccos(np.clip(mean[2] / np.linalg.norm(mean), -1.0, 1.0)))
+    tilt = _tilt(log, truth)
     if tilt > DOWN:
         return "the z axis of its world points down (as in NED). Turn it to z up."
     if tilt > MAX_TILT:
+        other = _tilt(log, _z_up(truth))
+        if min(other, np.pi - other) < MAX_TILT:
+            return NED if other > MAX_TILT else BODY_DOWN
         return (
             f"the vertical of its world is turned by {tilt / DEGREE:.0f} deg from gravity. Turn"
             " its poses into the world of the site, z up."
         )
     return ""
+
+
+def _tilt(log: Log, truth: Trajectory) -> float:
+    """Return the angle between the mean specific force in the truth's world and its z (rad)."""
+    force = [np.interp(truth.time, log.imu.time, axis) for axis in log.imu.accel_body.T]
+    mean = np.mean(truth.rotation.apply(np.stack(force, axis=1)), axis=0)
+    return float(np.arccos(np.clip(mean[2] / np.linalg.norm(mean), -1.0, 1.0)))
+
+
+def _z_up(truth: Trajectory) -> Trajectory:
+    """Return poses of a body forward, left, up, where those of one forward, right, down are."""
+    return Trajectory(truth.time, truth.world_from_body @ DOWN_AXES, truth.position_world)

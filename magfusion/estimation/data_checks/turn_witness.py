@@ -65,7 +65,52 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
     elif found.explained(np.eye(3)) > CONTRADICTED:
         yield from _turned_little(found, site)
     else:
-        yield from _contradicted(found)
+        left_handed = None if site is None else _left_handed(log, site, found)
+        yield from _contradicted(found) if left_handed is None else (left_handed,)
+
+
+def left_handed_field(log: Log, site: Site) -> Finding | None:
+    """Return the axes of the magnetometer that are reversed, whatever its hard iron is."""
+    if log.vectors is None or len(log.imu) < 2:
+        return None
+    lag = site.platform.imu.time_offset
+    rotation = turning(log.imu, log.vectors.time, field_body(log, site), lag)
+    if len(rotation.change) < 12 or not rotation.speed > LEAST_TURN:
+        return None
+    return _left_handed(log, site, rotation)
+
+
+def _left_handed(log: Log, site: Site, rotation: FieldRotation) -> Finding | None:
+    """Return which axes of a field are reversed, by its rotation and by its angle to gravity.
+
+    A field and its opposite rotate alike: reversed axes and a mounting by half a turn differ in the
+    angle between field and gravity, of which the Earth's field gives the sign.
+    """
+    earth = site.earth_field_world
+    signs = [one for one in axes() if np.count_nonzero(np.diagonal(one)) == 3]
+    turns = [one for one in signs if np.linalg.det(one) > 0.0]
+    explained = {k: rotation.explained_shifted(one) for k, one in enumerate(turns)}
+    best, second = sorted(explained, key=lambda k: explained[k][0])[:-3:-1]
+    (share, offset), rest = explained[best], 1.0 - explained[second][0]
+    if best == 0 or earth is None or share < EXPLAINED or BETTER * (1.0 - share) > rest:
+        return None
+    field, time = field_body(log, site), log.imu.time + site.platform.imu.time_offset
+    assert log.vectors is not None
+    force = [np.interp(log.vectors.time, time, axis) for axis in log.imu.accel_body.T]
+    centred = field - offset * float(np.median(np.linalg.norm(field, axis=1)))
+    upward = float(np.mean(np.sum(np.stack(force, axis=1) * (centred @ turns[best]), axis=1)))
+    if upward * earth[2] > 0.0:  # rightly turned: a mounting
+        return None
+    wrong = ", ".join(
+        a for a, sign in zip("xyz", np.diagonal(turns[best]), strict=True) if sign > 0
+    )
+    return Finding(
+        "mounting",
+        f"magnetometer: its axes are left-handed: {_words(rotation)}, and {_percent(share)} with"
+        f" the sign of {wrong} (body axes) reversed. Correct the driver.",
+        Verdict.FAILED,
+        1e3,
+    )
 
 
 def _contradicted(found: FieldRotation) -> Iterator[Finding]:

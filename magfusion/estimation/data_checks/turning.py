@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from magfusion.model.field import skew
 from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -36,6 +37,7 @@ class FieldRotation(NamedTuple):
 
     change: Array  # (n, 3), db/dt, body axes, as a share of the field (1/s)
     by_matrix: Array  # (n, 3, 9), its derivatives by the rows of M
+    rate: Array  # (n, 3), of the gyroscope, body axes (rad/s)
 
     @property
     def speed(self) -> float:
@@ -46,6 +48,17 @@ class FieldRotation(NamedTuple):
         """Return the share of the change that a matrix M (3, 3) explains; may be negative."""
         residual = self.change - self.by_matrix @ matrix.ravel()
         return float(1.0 - np.sum(residual**2) / np.sum(self.change**2))
+
+    def explained_shifted(self, matrix: Array) -> tuple[float, Array]:
+        """Return the share that M explains of a field with a constant offset, and that offset.
+
+        The offset (3,), of a hard iron, is a share of the field: its best fit.
+        """
+        residual = self.change - self.by_matrix @ matrix.ravel()
+        rows = skew(self.rate @ matrix.T).reshape(-1, 3)  # -(M rate) x (b - offset)
+        offset, *_ = np.linalg.lstsq(rows, residual.ravel(), rcond=None)
+        after = np.sum((residual.ravel() - rows @ offset) ** 2)
+        return float(1.0 - after / np.sum(self.change**2)), np.asarray(offset, dtype=np.float64)
 
     @property
     def expected_rate(self) -> float:
@@ -98,7 +111,7 @@ def turning(
     time = np.arange(field_time[0], field_time[-1] + 0.5 * step, step)
     reach = int(np.ceil(REACH / CUTOFF / step))
     if len(time) < 8 * reach:
-        return FieldRotation(np.zeros((0, 3)), np.zeros((0, 3, 9)))
+        return FieldRotation(np.zeros((0, 3)), np.zeros((0, 3, 9)), np.zeros((0, 3)))
     field = _interpolated(time, field_time, field_body)
     rate = _interpolated(time, imu.time + lag, imu.gyro_body)
     there = _covered(time, field_time, step) & _covered(time, imu.time + lag, step)
@@ -117,7 +130,7 @@ def turning(
     by_matrix = -np.einsum("ikj,nlj->nikl", _EPSILON, both.reshape(-1, 3, 3)).reshape(-1, 3, 9)
     missing = np.concatenate([[0.0], np.cumsum(~there)])
     whole = (missing[2 * reach + 1 :] == missing[: -2 * reach - 1])[::every]
-    return FieldRotation(change[whole], by_matrix[whole])
+    return FieldRotation(change[whole], by_matrix[whole], passed(rate, low)[whole])
 
 
 def _interpolated(time: Array, known: Array, value: Array) -> Array:

@@ -132,8 +132,8 @@ def released_blocks(fault: Suspect) -> tuple[Block, ...]:
     blocks = fault.blocks
     whole = fault.combine.shape[1] == sum(len(block.sigma) for block in blocks)
     declarable = all(block.parameter.declared for block in blocks)
-    alike = _are_estimated_together(blocks)
-    return blocks if whole and alike and declarable and not fault.code else ()
+    related = _are_estimated_together(blocks)
+    return blocks if whole and related and declarable and not fault.code else ()
 
 
 def estimated_blocks(declared: Site, corrected: Site) -> tuple[Block, ...]:

@@ -14,7 +14,6 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.calibration_data import calibration_rules, require
-from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
 from magfusion.estimation.graph.measurement import Measurement
@@ -32,6 +31,7 @@ from magfusion.estimation.online.window_prior import WindowPrior
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.levels import Levels
+from magfusion.estimation.online_integrity.running import DecayingSums
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.estimation.online_integrity.settlement import Rest
 from magfusion.files.plain_data import Rules, from_plain, to_plain

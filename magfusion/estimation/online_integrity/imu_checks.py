@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.steady_field import DOUBT
 from magfusion.estimation.graph.preintegration import bias_walks
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.running import DecayingSums
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.data_checks.running import DecayingSums, nothing
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.recovery import EXPLAINED
+from magfusion.estimation.online_integrity.running import DecayingSums, nothing
 from magfusion.model.noise import model_error, paired_whitening
 from magfusion.model.parameters import Block
 from magfusion.model.site import Site

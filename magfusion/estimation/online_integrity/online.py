@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, erfc
 
-from magfusion.estimation.data_checks.running import DecayingSums, nothing
 from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.imu_checks import judge_biases, judge_gravity
 from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.running import DecayingSums, nothing
 from magfusion.model.parameters import (
     Block,
     Calibration,

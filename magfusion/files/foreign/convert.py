@@ -17,6 +17,7 @@ from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows, coarse_text, copied_rows
 from magfusion.files.plausible import SHORTEST_STEP
+from magfusion.files.pose_rows import FEW_OFF, MOST_OFF, PoseRows
 from magfusion.files.row_stamps import batches_text, separate_stamps
 from magfusion.files.stray_stamps import (
     EDGE_S,
@@ -36,12 +37,9 @@ STEPS = {  # s
     **dict.fromkeys(("imu", "gyro", "accel"), (SHORTEST_STEP, 0.5)),
     "magnetometer": (1e-6, 0.5),
 }
-MOST_OFF = 0.01  # of a quaternion's length from one: rounding, or one that was interpolated
-FEW_OFF = 0.1  # of the rows, whose quaternions may be worse
 OTHER_CLOCK = 0.3  # of a truth's rows, that may be stamped by another clock
 # Reasons why rows are left out.
 STRAY, COPIES = "with a stray time", "that are copies of others"
-LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
 @dataclass
@@ -205,10 +203,7 @@ def _kept(
     missing: BoolArray = np.asarray(np.isnan(values[:, needed]).any(axis=1))
     if plan.stream == "truth":
         # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
-        counts.leave_out("without a pose", int(np.sum(keep & missing)))
-        keep &= ~missing
-        if QUATERNION[0] in names:
-            keep &= _is_rotation(values, [names.index(q) for q in QUATERNION], keep, counts)
+        keep[keep] = _with_poses(names, needed, values, keep, counts)
     stamps = _unwrapped(stamps, keep, counts)
     keep[keep] = ~_strays(plan.stream, stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
@@ -240,17 +235,19 @@ def _kept(
     return stamps, values
 
 
-def _is_rotation(values: Array, places: list[int], rows: BoolArray, counts: Counts) -> BoolArray:
-    """Return which of some rows have a quaternion of a rotation; scale it to unit length."""
-    length = np.linalg.norm(values[:, places], axis=1)
-    none = rows & (length < LEAST_QUATERNION)
-    off = rows & ~none & ~(np.abs(length - 1.0) <= MOST_OFF)
-    counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
-    counts.leave_out("with a quaternion not of unit length", int(np.sum(off)))
-    good = rows & ~none & ~off
-    values[np.ix_(good, places)] /= length[good, None]
-    counts.scaled = max(counts.scaled, float(np.max(np.abs(length[good] - 1.0), initial=0.0)))
-    return good
+def _with_poses(
+    names: list[str], needed: list[bool], values: Array, rows: BoolArray, counts: Counts
+) -> BoolArray:
+    """Return which of some rows have a pose; scale their quaternions to unit length."""
+    places = [names.index(q) for q in QUATERNION] if QUATERNION[0] in names else []
+    own = values[rows]
+    poses = PoseRows.of(own[:, needed], own[:, places] if places else None)
+    for reason, count in poses.left_out.items():
+        counts.leave_out(reason, count)
+    if poses.quaternion is not None:
+        values[np.flatnonzero(rows)[:, None], places] = poses.quaternion
+    counts.scaled = max(counts.scaled, poses.scaled)
+    return poses.kept
 
 
 def _unwrapped(stamps: IntArray, rows: BoolArray, counts: Counts) -> IntArray:
@@ -359,7 +356,14 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
     if not counts.written:
         reasons = ", ".join(f"{n} {reason}" for reason, n in counts.left_out.items())
         result = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
-        raise InputError(f"{place}: {result} for {stream}; record it again, or map other columns.")
+        remedy = "record it again, or map other columns"
+        if plan.rate is None and counts.left_out.get("without a time", 0) == counts.read > 0:
+            unit = plan.terms[TIME][0].unit
+            remedy = (
+                f"the times are empty, or beyond any clock in {unit}: give their unit by --map"
+                f" '{stream}.time=NAME[ns]'"
+            )
+        raise InputError(f"{place}: {result} for {stream}; {remedy}.")
     off = counts.left_out.get("with a quaternion not of unit length", 0)
     if off > FEW_OFF * (counts.written + off):
         raise InputError(

@@ -14,7 +14,15 @@ import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.arrays import array_source
-from magfusion.files.foreign.columns import EULER, STREAMS, TIME, VELOCITY, Term, terms_by_place
+from magfusion.files.foreign.columns import (
+    EULER,
+    QUATERNION,
+    STREAMS,
+    TIME,
+    VELOCITY,
+    Term,
+    terms_by_place,
+)
 from magfusion.files.foreign.convert import converted_rows
 from magfusion.files.foreign.guess import named_columns
 from magfusion.files.foreign.guess_by_values import likely_time_unit
@@ -23,7 +31,6 @@ from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
 from magfusion.files.foreign.units import NO_STAMP, Dimension, resolution_ns
 from magfusion.files.inertial_tables import read_imu, read_waveform
-from magfusion.files.lost_rows import copies_findings
 from magfusion.files.stray_stamps import all_strays, counted_back
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.files.table import Span, find_table
@@ -71,17 +78,35 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         (None, ()) if field is None else read_waveform(field.path, span, field.content)
     )
     noticed = [finding for table in tables.values() for finding in table.noticed]
-    copies: list[str] = []
-    truth = _truth(tables.get("truth"), span, copies)
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
         imu=samples,
         waveform=waveform,
-        truth=truth,
-        noticed=(*noticed, *of_imu, *of_waveform, *copies_findings(copies)),
+        truth=_truth(tables.get("truth"), span, noticed),
+        noticed=(*noticed, *of_imu, *of_waveform),
     )
+
+
+def read_euroc_poses(path: Path, epoch_ns: int, noticed: list[Finding] | None) -> Trajectory:
+    """Read a table of poses whose head names them as EuRoC's ground truth does.
+
+    `noticed` as of `read_trajectory`. Raises InputError where the head names no whole poses.
+    """
+    source = array_source(path) if path.suffix == ".parquet" else text_source(path)
+    named = named_columns(source.columns, "truth")
+    whole = TIME, "position_x", "position_y", "position_z", *QUATERNION
+    if any(len(named[name]) != 1 for name in whole):
+        names = ", ".join(column.name for column in source.columns)
+        raise InputError(
+            f"{path}: has no column {TIME_NS}, and its head ({names}) is not that of EuRoC; convert"
+            f" it by magfusion import --truth {path}."
+        )
+    table = _read("truth", path)
+    if noticed is not None:
+        noticed += table.noticed
+    return read_trajectory(path, epoch_ns, content=table.content, noticed=noticed)
 
 
 def euroc_tables(path: Path) -> dict[str, Path]:
@@ -172,7 +197,8 @@ def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     size = resolution_ns(first_values(source, term.place, True), term.unit)
     if size <= 1.0:
         return ()
-    text = f"{stream}: stamps are read as {term.unit}; their resolution is {size * 1e-3:.3g} us."
+    shown = f"{size * 1e-3:.3g} us" if size < 1e6 else f"{size * 1e-6:.3g} ms"
+    text = f"{stream}: stamps are read as {term.unit}; their resolution is {shown}."
     return (Finding("stamp_resolution", text, _REMARK),)
 
 
@@ -185,8 +211,8 @@ def _first_sample(table: _StreamTable) -> int:
     return counted_back(stamps[~stray], int(np.argmin(stray)))
 
 
-def _truth(table: _StreamTable | None, span: Span, copies: list[str]) -> Trajectory | None:
+def _truth(table: _StreamTable | None, span: Span, noticed: list[Finding]) -> Trajectory | None:
     if table is None:
         return None
-    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, copies)
+    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, noticed)
     return truth if len(truth) else None

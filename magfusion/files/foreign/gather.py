@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from magfusion.errors import InputError
 from magfusion.files.bag_reader import is_ros1
 from magfusion.files.bag_topics import is_bag, refuse_bag_folders
@@ -16,11 +18,13 @@ from magfusion.files.foreign.guess import streams_of
 from magfusion.files.foreign.halves import HALVES
 from magfusion.files.foreign.map_file import ImportRequest
 from magfusion.files.foreign.phasors import PhasorPlan, plan_phasors
-from magfusion.files.foreign.plan import Findings, ImportPlan, plan_stream
+from magfusion.files.foreign.plan import Findings, ImportPlan, first_values, plan_stream
 from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
+from magfusion.files.foreign.units import stamp_numbers
 from magfusion.files.log_header import has_header
+from magfusion.files.tum import tum_time_unit
 from magfusion.model.site import Site
 
 TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
@@ -294,7 +298,8 @@ def _table(
     usual = None
     if path.suffix.lower() == ".tum" and stream == "truth":
         columns = {name: STREAMS[stream][name] for name in _TUM}
-        usual = terms_by_place(columns, source.columns, "s")
+        largest = np.max(np.abs(stamp_numbers(first_values(source, 0, True))), initial=0.0)
+        usual = terms_by_place(columns, source.columns, tum_time_unit(float(largest)))
     entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
     return plan_stream(stream, source, entries, rate, declared, usual)
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.fields import write_fields
+from magfusion.files.fields import refuse_unsigned, write_fields
 from magfusion.files.foreign.columns import TIME
 from magfusion.files.foreign.convert import Counts, stamps_of
 from magfusion.files.foreign.phasors import (
@@ -74,10 +74,20 @@ def write_phasors(plan: PhasorPlan, path: Path) -> Counts:
     samples = FieldSamples(
         *(seconds, window, channels, phasor, cov), axes=result.axes, signed=result.signed
     )
+    refuse_unsigned(samples, _frequencies(plan, channels), plan.source.place)
     write_fields(samples, path, int(time_ns[0]))
     counts.first, counts.last = int(time_ns[0]), int(time_ns[-1])
     counts.written = int(np.sum(np.isfinite(phasor).any(axis=2)))
     return counts
+
+
+def _frequencies(plan: PhasorPlan, channels: tuple[Channel, ...]) -> Array:
+    """Return the frequency of each channel (Hz): 0 of levels, 1 of tones that no site gives."""
+    levels = AMBIENT in plan.coils or "slot" in plan.terms or plan.frame > 0
+    if plan.site is None:
+        return np.full(len(channels), 0.0 if levels else 1.0)
+    known = dict(zip(plan.site.channels, plan.site.tone_frequencies_hz, strict=True))
+    return np.array([known.get(channel, 0.0) for channel in channels])
 
 
 def is_signed(path: Path) -> bool:

@@ -19,6 +19,7 @@ from magfusion.files.foreign.units import Raw
 
 BLOCK = 1 << 22  # bytes
 TORN = "not of as many cells as the others"
+REPEATED = "that repeat the head"
 
 
 def text_source(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Source:
@@ -82,6 +83,7 @@ def _batches(
             counts[TORN] = counts.get(TORN, 0) + 1
         return "skip"
 
+    heads = _head_lines(path, dialect)
     names = [f"c{k}" for k in range(len(dialect.columns))]
     parse = pa.csv.ParseOptions(delimiter=dialect.delimiter, invalid_row_handler=torn)
     convert = pa.csv.ConvertOptions(
@@ -92,31 +94,54 @@ def _batches(
         decimal_point=dialect.decimal,
     )
     with _opened(path, dialect) as stream:
-        for lines in _whole_lines(stream):
+        for content in _whole_lines(stream):
+            lines = _of_arrow(_without_heads(content, heads, counts))
             read = pa.csv.ReadOptions(column_names=names, block_size=lines.size, use_threads=False)
             table = pa.csv.read_csv(pa.BufferReader(lines), read, parse, convert)
             # Without rows, too: of those that were torn the next part tells.
             yield from table.to_batches() or [pa.RecordBatch.from_pylist([], table.schema)]
 
 
-def _whole_lines(stream: Any) -> Iterator[pa.Buffer]:
-    """Yield a text, some megabytes of whole lines at a time, in memory of Arrow's own.
+def _head_lines(path: Path, dialect: Dialect) -> set[bytes]:
+    """Return the lines of names above the data, as `_opened` would give them."""
+    with path.open("rb") as stream:
+        text = stream.read(dialect.offset).decode(dialect.encoding, "replace")
+    if dialect.delimiter == SPACES:
+        text = re.sub(r"[ \t]+", " ", text)
+    lines = {line.strip().lstrip("\ufeff") for line in text.splitlines()}
+    return {line.encode() for line in lines if re.search("[A-Za-z]", line)}
 
-    Arrow reads ahead in threads.  One that holds an object of Python when the process ends, as it
-    does where a table is refused, aborts it: Arrow is given nothing of Python's.
-    """
+
+def _without_heads(content: bytes, heads: set[bytes], counts: dict[str, int]) -> bytes:
+    """Return lines without repeated heads, as of files that were joined, and count these."""
+    if not any(head in content for head in heads):
+        return content
+    lines = content.splitlines(keepends=True)
+    kept = [line for line in lines if line.strip() not in heads]
+    if len(kept) < len(lines):
+        counts[REPEATED] = counts.get(REPEATED, 0) + len(lines) - len(kept)
+    return b"".join(kept)
+
+
+def _whole_lines(stream: Any) -> Iterator[bytes]:
+    """Yield a text, some megabytes of whole lines at a time."""
     rest = b""
     while block := stream.read(BLOCK):
         whole = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1
         if whole:
-            yield _of_arrow(rest + block[:whole])
+            yield rest + block[:whole]
             rest = b""
         rest += block[whole:]
     if rest:
-        yield _of_arrow(rest)
+        yield rest
 
 
 def _of_arrow(content: bytes) -> pa.Buffer:
+    """Return a text in memory of Arrow's own.
+
+    Arrow reads ahead in threads.  One that holds an object of Python when the process ends, as it
+    does where a table is refused, aborts it: Arrow is given nothing of Python's.
+    """
     stream = pa.BufferOutputStream()
     stream.write(content)
     return stream.getvalue()

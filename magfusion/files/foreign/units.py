@@ -210,7 +210,9 @@ def _scaled_integers(values: IntArray, scale: Fraction) -> IntArray:
     maximum = float(np.max(np.abs(values.astype(np.float64)), initial=0.0))
     if maximum * scale.numerator < 2.0**62:
         return np.asarray((values * scale.numerator + scale.denominator // 2) // scale.denominator)
-    return _rounded(values.astype(np.float64) * float(scale))
+    scaled = values.astype(np.float64) * float(scale)
+    far = ~(np.abs(scaled) < 2.0**62)
+    return np.where(far, NO_STAMP, _rounded(np.where(far, 0.0, scaled)))
 
 
 def _scaled_floats(values: Array, scale: Fraction) -> IntArray:
@@ -255,8 +257,9 @@ def _decimals(raw: pa.Array, scale: Fraction) -> IntArray:
     rest = pc.binary_join_element_wise("0", pc.struct_field(parts, "rest"), "")
     rest = pc.cast(rest, pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False)
     sign = np.where(np.signbit(numbers), -1, 1)
-    stamps = _scaled_integers(whole, scale) + sign * _rounded(rest * float(scale))
-    return np.where(present, stamps, NO_STAMP)
+    stamps = _scaled_integers(whole, scale)
+    known = present & (stamps != NO_STAMP)
+    return np.where(known, stamps + sign * _rounded(rest * float(scale)), NO_STAMP)
 
 
 def _dates(raw: Raw) -> IntArray:
