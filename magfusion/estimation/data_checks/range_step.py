@@ -31,7 +31,7 @@ def range_step(log: Log, site: Site | None) -> Iterator[Finding]:
     before, after = level[at - NEAR : at], level[at + 1 : at + 1 + NEAR]
     step = float(np.median(after) - np.median(before))
     if (
-        abs(step) > max(LEAST_STEP, CERTAIN * max(np.std(before), np.std(after)))
+        abs(step) > max(LEAST_STEP, CERTAIN * float(max(np.std(before), np.std(after))))
         and (of_tones[at + 1] - of_tones[at - 1]) / step > LEAST_TONES
     ):
         yield Finding(
