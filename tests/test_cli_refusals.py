@@ -23,10 +23,6 @@ def _change_site(path: Path, change: Callable[[dict[str, Any]], object]) -> None
     path.write_text(yaml.safe_dump(site))
 
 
-def _set(column: str, row: int, value: object) -> Callable[[dict[str, Any]], object]:
-    return lambda c: c[column].__setitem__(row, value)
-
-
 def _in_nanotesla(columns: dict[str, Any]) -> None:
     for name in ("field_x", "field_y", "field_z"):
         columns[name] = [1e9 * value for value in columns[name]]
@@ -44,9 +40,8 @@ BAD_TABLES = {
     "a time twice": (
         "magnetometer",
         lambda c: c["time_ns"].__setitem__(slice(8, 2000), [c["time_ns"][7]] * 1992),
-        r"time_ns, row 8.*remove one",
+        r"1992 of \d+ rows have the stamp of another.*--rate-hz magnetometer",
     ),
-    "infinity": ("imu", _set("accel_z", 5, float("inf")), r"accel_z, row 5.*write a finite number"),
     "a field in nT": ("magnetometer", _in_nanotesla, "(tesla| T)"),
 }
 
@@ -247,7 +242,7 @@ BAD_OPTIONS = [
     ("view LOG/site.yaml", "not a recording"),
     ("evaluate NONE LOG", "NONE: there is no such file"),
     ("evaluate LOG LOG", "has no trajectory.parquet"),
-    ("evaluate LOG/site.yaml LOG", "line 1.*write eight finite numbers"),
+    ("evaluate LOG/site.yaml LOG", "line 1.*write eight numbers"),
     ("evaluate LOG/imu.parquet LOG", "columns position_x, .* are missing"),
     ("evaluate LOG/truth.parquet NONE", "NONE: there is no such file"),
 ]
