@@ -319,3 +319,20 @@ def test_losses_and_pauses_are_no_bursts(scatter: float, seed: int) -> None:
     streams.append(even + np.cumsum(stalls)[np.searchsorted(ends, tick, side="right")])
     assert [spread_bursts(one) is not None for one in streams] == [False] * len(streams)
     assert [spread_bursts(one[:200]) is not None for one in streams] == [False] * len(streams)
+
+
+@pytest.mark.parametrize("scatter", [0.4, 0.7, 1.0])
+def test_jitter_of_a_step_is_no_loss(scatter: float) -> None:
+    """A driver that stamps samples in order, up to some steps late: they are all there."""
+    rng = np.random.default_rng(2)
+    selected = STEP * np.arange(COUNT)
+    stamps = np.sort(selected + STEP * scatter * rng.standard_normal(COUNT))
+    clock = sampling_clock(stamps)
+    assert clock is not None
+    assert clock.lost_count == 0
+    assert clock.step == pytest.approx(STEP, rel=1e-3)
+    assert np.max(np.abs(clock.time - selected)) < 0.1 * STEP
+    # Of those that lose samples, too, the count is no clock.
+    part = stamps[rng.random(COUNT) > 0.02]
+    lossy = sampling_clock(part)
+    assert lossy is None or lossy.lost_count > 0

@@ -163,7 +163,9 @@ _PYDANTIC = frozenset(get_args(ErrorType))
 def sentence(error: ValidationError, model: type[BaseModel], whole: str = "file") -> str:
     """Return what is wrong, and the remedy, of content that does not fit its model."""
     # An unknown key is, as a rule, a misspelt one that is reported as missing, too.
-    every = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+    every = sorted(
+        error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden"
+    )
     first, others = every[0], len(every) - 1
     named, within = _followed(model, first["loc"])
     place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in named).lstrip(".")

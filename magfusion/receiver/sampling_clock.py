@@ -26,6 +26,10 @@ MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
 MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
 MAX_DELAY = 32  # steps, by which a host delivers late
+LARGE_JITTER = 0.3  # of a step, standard deviation of steps from which a tick may be mistaken
+OWN_JITTER = 0.7  # correlation of neighbours below which samples are late each by itself; sorting
+# stamps that scatter by a step correlates them by about a half
+ACCUMULATED = 1.2  # times the scatter within a piece, that losses leave in a longer one
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
 SHORT = 0.1  # share of the steps; the shortest kind has more
@@ -60,10 +64,10 @@ def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
     a time.
     """
     separate, size = spread_bursts(stamps) if bundled else None, stamp_resolution(stamps)
-    if separate is None:
-        clock = _scattered_clock(stamps, ROUNDING_RMS * size)
+    if separate is not None:
+        clock: SamplingClock | None = _counted_clock(stamps, separate)
     else:
-        clock = _counted_clock(stamps, separate)
+        clock = _jittery_clock(stamps) or _scattered_clock(stamps, ROUNDING_RMS * size)
     if clock is None:
         return None
     return clock._replace(resolution=size if clock.scatter < MAX_ROUNDING * size else 0.0)
@@ -161,6 +165,22 @@ def _counted_step(stamps: Array) -> float | None:
     off = _off_lines(stamps)
     rounding = min(stamp_resolution(stamps) or median, median)  # a loss is a whole step
     return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * rounding else None
+
+
+def _jittery_clock(stamps: Array) -> SamplingClock | None:
+    """Return the clock of stamps that scatter so much that single steps show no losses.
+
+    None where there are losses: a loss shifts all later samples, jitter each by itself.
+    """
+    if len(stamps) < PIECE or lossy_step(stamps):
+        return None
+    steps, off = np.diff(stamps), _off_lines(stamps)
+    if np.std(steps) < LARGE_JITTER * np.mean(steps):
+        return None
+    if np.sum(off[1:] * off[:-1]) > OWN_JITTER * np.sum(off**2):
+        return None
+    clock = _counted_clock(stamps, stamps)
+    return clock if clock.scatter < ACCUMULATED * np.std(off) else None
 
 
 def lossy_step(stamps: Array) -> float | None:
