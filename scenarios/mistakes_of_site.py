@@ -74,6 +74,13 @@ def _angles(change: Callable[[Array], Array]) -> Callable[[Beacon], Beacon]:
     return changed
 
 
+def _coil_advanced(beacon: Beacon) -> Beacon:
+    first, second, *others = beacon.coils
+    return replace(
+        beacon, coils=(first, replace(second, phase=second.phase + 8.0 * DEGREE), *others)
+    )
+
+
 def _exchanged(*fields: str, count: int = 2) -> Change:
     """Return the mistake of taking the first beacons for each other, in turn, in some respects."""
 
@@ -212,6 +219,7 @@ MISTAKES = (
         of_beacons(_phases(lambda p: p * DEGREE)),
         ("phase_units", "phase", "phase_sign"),
     ),
+    Mistake("coil_phase_8deg", "site", of_beacons(_coil_advanced, "B"), ("phase",)),
     Mistake("phase_10deg_one", "site", of_beacons(_phase_late, "C"), ("phase", "beacon_pose")),
     Mistake("coil_reversed", "site", of_beacons(_moments(-1.0, 0), "C"), _SIGN),
     Mistake("beacon_reversed", "site", of_beacons(_moments(-1.0), "D"), (*_SIGN, "beacon_pose")),

@@ -51,6 +51,7 @@ NAMED = {
     "beacon_rpy_radians": "angle_units",
     "phase_rad_for_deg": "phase_units",
     "phase_10deg_one": "phase",
+    "coil_phase_8deg": "phase",
     "survey_mirrored": "survey_axes",
     "survey_in_feet": "length_units",
     "mounting_x180": "mounting",

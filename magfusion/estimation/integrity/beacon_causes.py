@@ -16,6 +16,7 @@ from magfusion.estimation.integrity.field_causes import (
     scaled,
 )
 from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.estimation.integrity.phase_causes import coil_phase
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_separation import MIN_DETECTED
 from magfusion.model.detection_range import are_many
@@ -214,6 +215,7 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
     yield from rewired
     if any(one.clear for one in rewired):
         return  # to turn the beacon over, or its phase, says the same in other words
+    yield from coil_phase(known, beacon, trial)
     after, found = known.fitted([(LOG_MOMENT, name, WIDE[2])], fixes)
     factors = np.exp(LOG_MOMENT.difference(known.calibration, found, name))
     yield _explained(

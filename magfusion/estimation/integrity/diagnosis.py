@@ -117,7 +117,8 @@ def diagnosed(
         return None
     parts = trust.verdict, log, site
     known = _diagnosis(one, text, *parts, several=several)
-    if not known.is_clear and is_steel:
+    explains_all = one.after < one.expected and not one.catch_all
+    if is_steel and not (known.is_clear or explains_all):
         return None
     if one.rival is None:
         return known

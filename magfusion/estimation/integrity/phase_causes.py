@@ -1,9 +1,11 @@
 """What may be wrong with clocks and drive phases: each epoch's phases are found beside its pose."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
@@ -11,6 +13,7 @@ from magfusion.estimation.integrity.field_causes import left_handed
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon
 from magfusion.units import DEGREE, Array
 
 TWO_PI = 2.0 * np.pi
@@ -21,6 +24,7 @@ COMMON = 0.2  # spread of relative rates, of their mean, that is one clock's
 STILL = 2e-6  # relative rate that is none
 REVERSED = 0.1  # rad, that a phase may be off a half turn
 ALIKE = 0.7  # of the chi square of constant phases, that those of other clocks may leave
+LARGEST_ADVANCE = 60.0 * DEGREE  # rad; beyond, a coil is reversed or in the wrong quadrature
 DENSE = 60  # neighbouring epochs that tell a rate
 
 
@@ -160,3 +164,39 @@ def _shift(phase: Array, tones_hz: Array) -> float:
     best = float(trial[near[np.argmin(np.abs(trial[near]))]])
     left = np.angle(np.exp(1j * (phase + TWO_PI * tones_hz * best)))
     return best - float(np.sum(left * tones_hz) / np.sum(TWO_PI * tones_hz**2))
+
+
+def coil_phase(
+    known: Snapshots, beacon: Beacon, trial: Callable[[Beacon], Snapshots]
+) -> Iterator[Explanation]:
+    """Yield the phase of one of several coils at one tone, against the others.
+
+    `trial`: returns the snapshots with the beacon replaced.
+    """
+    tones = Counter((coil.frequency_hz, coil.slot) for coil in beacon.coils)
+
+    def advanced(k: int, angle: float) -> Beacon:
+        coils = list(beacon.coils)
+        coils[k] = replace(coils[k], phase=coils[k].phase + angle)
+        return replace(beacon, coils=tuple(coils))
+
+    for k, coil in enumerate(beacon.coils):
+        if tones[coil.frequency_hz, coil.slot] < 2:
+            continue
+        found = minimize_scalar(
+            lambda angle, k=k: trial(advanced(k, angle)).chi_square,
+            bounds=(-LARGEST_ADVANCE, LARGEST_ADVANCE),
+            method="bounded",
+            options={"xatol": 0.1 * DEGREE},
+        )
+        after = trial(advanced(k, float(found.x)))
+        result = _said(
+            known,
+            after,
+            1,
+            "phase",
+            f"the phase of coil {k} of beacon {beacon.name} is {found.x / DEGREE:+.3g} degrees"
+            " beyond the declared",
+            "Check its phase_deg, and the phase between the channels of its drive.",
+        )
+        yield replace(result, site=after.site)
