@@ -28,6 +28,18 @@ def tilt(site: dict[str, Any]) -> None:
         beacon["rpy_deg"] = (turn * attitude).as_euler("xyz", degrees=True).tolist()
 
 
+def tilt_of_a_tape_s_survey(site: dict[str, Any]) -> None:
+    tilt(site)
+    for beacon in site["beacons"]:
+        beacon["sigma"] = {"position_m": 0.01, "rotation_deg": 0.5}
+
+
+def beacon_moved(site: dict[str, Any]) -> None:
+    for beacon in site["beacons"]:
+        beacon["sigma"] = {"position_m": 0.01, "rotation_deg": 0.5}
+    site["beacons"][1]["position_m"][0] += 0.5
+
+
 def coil_reversed(site: dict[str, Any]) -> None:
     coil = site["beacons"][0]["coils"][0]
     coil["moment_a_m2"] = [-value for value in coil["moment_a_m2"]]
@@ -60,6 +72,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.param(lever_arm, "lever_arm", id="lever arm"),
         pytest.param(coil_reversed, "coil_reversed", id="coil", marks=pytest.mark.slow),
         pytest.param(tilt, "survey_tilt", id="tilt", marks=pytest.mark.slow),
+        pytest.param(tilt_of_a_tape_s_survey, "survey_tilt", id="tape", marks=pytest.mark.slow),
+        pytest.param(beacon_moved, "beacon_pose", id="moved", marks=pytest.mark.slow),
         pytest.param(
             attitudes_exchanged, "beacons_swapped", id="attitudes", marks=pytest.mark.slow
         ),
@@ -88,6 +102,9 @@ def test_a_mistake_is_undone_and_its_remedy_works(
         sigma = np.array(first["remedy"]["platform.magnetometer.sigma.position_m"])
         assert np.all(np.abs(here - there) < 4.0 * sigma)
         assert np.all(sigma < 0.005)  # m
+    if code == "beacon_pose":
+        assert np.max(first["remedy"]["beacons[1].sigma.position_m"]) < 0.05  # m
     again = smoothed(log, site, tmp_path / "again")
     assert again["verdict"] == "trustworthy"
     assert again["ate_m"] < 0.02  # m
+    assert again["nees_mean"] < 20.0

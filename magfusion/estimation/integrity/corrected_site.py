@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.released_fault import ReleaseGain
 from magfusion.estimation.integrity.suspects import (
     SAMPLE_RATE,
     STRETCH,
@@ -14,6 +15,7 @@ from magfusion.estimation.integrity.suspects import (
     TYPICAL_TILT,
     Suspect,
 )
+from magfusion.model.field import skew
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import (
     PHASE,
@@ -122,6 +124,29 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
     for block in fault.blocks:
         site = _moved(site, block, block.sigma * step[block.columns])
     return site
+
+
+def corrected_by(site: Site, cause: ReleaseGain) -> Site:
+    """Return a site with the parameters of a cause corrected.
+
+    Gravity levels what remains of a tilt about the middle of the beacons, which the correction
+    moves about the origin: that is added to the sigmas of those whose positions are estimated.
+    """
+    result = corrected_site(site, cause.fault, cause.step)
+    if cause.fault.code != TILT:
+        return result
+    back = np.linalg.pinv(cause.fault.combine)
+    tilt_cov = np.zeros((3, 3))
+    tilt_cov[:2, :2] = TYPICAL_TILT**2 * back @ cause.cov @ back.T  # rad^2
+    arm = skew(np.mean([beacon.position_world for beacon in site.beacons], axis=0))
+    common = len(site.beacons) * np.diagonal(arm @ tilt_cov @ arm.T)
+
+    def widened(beacon: Beacon) -> Beacon:
+        known = beacon.sigma.position_world
+        sigma = np.where(known > 0.0, np.sqrt(known**2 + common), 0.0)
+        return replace(beacon, sigma=replace(beacon.sigma, position_world=sigma))
+
+    return replace(result, beacons=tuple(widened(beacon) for beacon in result.beacons))
 
 
 def released_blocks(fault: Suspect) -> tuple[Block, ...]:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.change_detection import CHANGED
 from magfusion.estimation.integrity.corrected_site import (
+    corrected_by,
     corrected_site,
     estimated_blocks,
     released_blocks,
@@ -128,7 +129,7 @@ def _by_score(
     other = next((one for one in rivals if one.code != CHANGED), None)  # no site undoes a step
     known = Correction(
         finding,
-        corrected_site(site, best.fault, best.step),
+        corrected_by(site, best),
         best.fault,
         alternative=None if other is None else _by_score(site, finding_of(site, other), other),
         step=best.step,

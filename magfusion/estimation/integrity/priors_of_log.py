@@ -11,8 +11,23 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
+from magfusion.estimation.integrity.released_fault import ReleasedFault
+from magfusion.estimation.integrity.suspects import (
+    RARE,
+    TILT,
+    TYPICAL_TILT,
+    Suspect,
+    survey_tilt,
+)
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
-from magfusion.model.parameters import Block, Parameter, difference
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    Block,
+    Parameter,
+    difference,
+)
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -42,7 +57,57 @@ def calibration_change(case: Case) -> TestResult:
         if kind in excess
     ]
     factor = np.full(len(case.pose_cov), max(excess.values()))
+    tilt = _tilt(case, change, cov)
+    if tilt is not None:
+        return TestResult((_of_tilt(tilt),), factor=factor, causes=(tilt,))
     return TestResult(tuple(findings or [_of_all(*whole)]), factor=factor)
+
+
+def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
+    """Return the tilt of the survey if it explains the change of the calibration; else None."""
+    site, blocks = case.result.declared.site, case.result.blocks
+    surveyed = tuple(b for b in blocks if b.parameter in (BEACON_POSITION, BEACON_ROTATION))
+    if not site.platform.inertial or len(surveyed) < max(2 * len(site.beacons), 1):
+        return None
+    tilt = survey_tilt(site, surveyed, len(change))
+    value, vector = np.linalg.eigh(0.5 * (cov + cov.T))
+    whiten = vector[:, value > MIN_INFORMATION_RATIO] / np.sqrt(
+        value[value > MIN_INFORMATION_RATIO]
+    )
+    residual, by_tilt = whiten.T @ change, whiten.T @ tilt
+    information, turn = np.linalg.eigh(by_tilt.T @ by_tilt)
+    along = turn.T @ by_tilt.T @ residual
+    gain = float(np.sum(along**2 / information))
+    left = float(residual @ residual) - gain
+    if gain + 2.0 * np.log(RARE) < LEAST_EVIDENCE or left > TOLERATED * len(residual):
+        return None
+    count = len(case.pose_cov)
+    return ReleasedFault(
+        Suspect("the vertical of the survey", surveyed, tilt, TILT, RARE),
+        step=tilt @ turn @ (along / information),
+        direction=tilt @ turn,
+        information=information,
+        along=along,
+        chi_square=gain,
+        freedom=2,
+        moved=np.zeros((count, 6)),  # the result has moved the beacons
+        distance=np.zeros(count),
+    )
+
+
+def _of_tilt(cause: ReleasedFault) -> Finding:
+    size = np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0]
+    tilt_deg = -np.rad2deg(TYPICAL_TILT * size)  # the step takes it back
+    sure = float(sigmas(cause.log_p))
+    return Finding(
+        TILT,
+        "The log moves all beacons together, as gravity contradicts the vertical of the survey: it"
+        f" is tilted by {tilt_deg[0]:+.2g} deg about x and {tilt_deg[1]:+.2g} deg about y"
+        f" ({sure:.0f} sigma). Rotate positions and attitudes of all beacons back: world z is the"
+        " plumb line.",
+        Verdict.DOUBTFUL,
+        sure,
+    )
 
 
 def _too_far(
