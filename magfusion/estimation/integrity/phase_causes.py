@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
 from magfusion.estimation.integrity.field_causes import left_handed
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.solve.bounded import minimise_between
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon
 from magfusion.units import DEGREE, Array
@@ -183,19 +183,19 @@ def coil_phase(
     for k, coil in enumerate(beacon.coils):
         if tones[coil.frequency_hz, coil.slot] < 2:
             continue
-        found = minimize_scalar(
+        angle, _ = minimise_between(
             lambda angle, k=k: trial(advanced(k, angle)).chi_square,
-            bounds=(-LARGEST_ADVANCE, LARGEST_ADVANCE),
-            method="bounded",
-            options={"xatol": 0.1 * DEGREE},
+            -LARGEST_ADVANCE,
+            LARGEST_ADVANCE,
+            0.1 * DEGREE,
         )
-        after = trial(advanced(k, float(found.x)))
+        after = trial(advanced(k, angle))
         result = _said(
             known,
             after,
             1,
             "phase",
-            f"the phase of coil {k} of beacon {beacon.name} is {found.x / DEGREE:+.3g} degrees"
+            f"the phase of coil {k} of beacon {beacon.name} is {angle / DEGREE:+.3g} degrees"
             " beyond the declared",
             "Check its phase_deg, and the phase between the channels of its drive.",
         )
