@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -180,14 +181,14 @@ def coil_phase(
         coils[k] = replace(coils[k], phase=coils[k].phase + angle)
         return replace(beacon, coils=tuple(coils))
 
+    def cost(k: int, angle: float) -> float:
+        return trial(advanced(k, angle)).chi_square
+
     for k, coil in enumerate(beacon.coils):
         if tones[coil.frequency_hz, coil.slot] < 2:
             continue
         angle, _ = minimise_between(
-            lambda angle, k=k: trial(advanced(k, angle)).chi_square,
-            -LARGEST_ADVANCE,
-            LARGEST_ADVANCE,
-            0.1 * DEGREE,
+            partial(cost, k), -LARGEST_ADVANCE, LARGEST_ADVANCE, 0.1 * DEGREE
         )
         after = trial(advanced(k, angle))
         result = _said(
