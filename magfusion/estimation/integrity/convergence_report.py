@@ -1,6 +1,6 @@
 """Tests of the estimator's result: convergence, ambiguity and observability."""
 
-from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.distance import pdist
@@ -9,7 +9,7 @@ from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.convergence import pose_steps
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.units import DEGREE, Array
 
 DIVERGED = 3.0  # whitened residual, one where noise and model are as declared
@@ -103,13 +103,13 @@ def geometry(case: Case) -> TestResult:
     return TestResult((Finding("geometry", text, verdict, weight),))
 
 
-def too_wide(site: Site, pose_cov: Array) -> Iterator[Finding]:
-    """Yield that a result with its final covariance is as uncertain as the site is large.
+def with_width(trust: Trust, site: Site, pose_cov: Array) -> Trust:
+    """Return the findings, of which the first fails a result as uncertain as the site is large.
 
     Parameters
     ----------
     pose_cov : ndarray, shape (n, 6, 6)
-        Rotation and position, body axes (rad^2, rad m, m^2).
+        Final, of rotation and position, body axes (rad^2, rad m, m^2).
     """
     rotation, position = (
         float(np.sqrt(np.median(np.trace(pose_cov[:, part, part], axis1=1, axis2=2)) / 3.0))
@@ -117,10 +117,13 @@ def too_wide(site: Site, pose_cov: Array) -> Iterator[Finding]:
     )
     places = np.array([beacon.position_world for beacon in site.beacons])
     size = float(np.max(pdist(places))) if len(places) > 1 else np.inf
-    if position > size or rotation > ANY_ATTITUDE:
-        yield Finding(
-            "geometry",
-            f"The result is useless: its sigma is {position:.2g} m and {rotation / DEGREE:.2g} deg"
-            " an axis. Remove the other reasons and repeat.",
-            Verdict.FAILED,
-        )
+    if not trust.reasons or (position < size and rotation < ANY_ATTITUDE):
+        return trust
+    first = trust.reasons[0]
+    text = (
+        f"{first.text} The result is useless: its sigma is {position:.2g} m and"
+        f" {rotation / DEGREE:.2g} deg an axis."
+    )
+    failed = replace(first, text=text, verdict=Verdict.FAILED)
+    findings = (failed if finding is first else finding for finding in trust.findings)
+    return replace(trust, findings=tuple(findings))

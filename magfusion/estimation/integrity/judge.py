@@ -19,7 +19,7 @@ from magfusion.estimation.integrity.convergence_report import (
     convergence,
     geometry,
     rivals,
-    too_wide,
+    with_width,
 )
 from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
@@ -126,7 +126,7 @@ def judged_with_score(result: R, log: Log, online: Site | None = None) -> Judged
     final_cov = factor[:, None, None] * pose_cov + spread
     widened = replace(result.states, pose_cov=final_cov)
     if online is None:
-        trust |= Trust(tuple(too_wide(result.declared.site, final_cov)))
+        trust = with_width(trust, result.declared.site, final_cov)
     score = score if in_region is None else in_region
     return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
 
