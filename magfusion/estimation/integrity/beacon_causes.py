@@ -12,6 +12,7 @@ from magfusion.estimation.integrity.field_causes import (
     LENGTH_FACTORS,
     MOMENT_FACTORS,
     coils_exchanged,
+    in_other_unit,
     length_cause,
     scaled,
 )
@@ -149,7 +150,8 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
     # A room that is larger and has stronger beacons has the same fields.
     units = [w for w, f in LENGTH_FACTORS.items() if abs(best * f**3 - 1.0) < 0.03]
     if units:
-        yield _explained(known, after, 1, *length_cause(units[0]))
+        metric = in_other_unit(known.site, units[0])
+        yield _explained(known, after, 0, *length_cause(units[0]), metric)
         return
     if steady is not None and abs(steady / best - 1.0) < abs(steady - 1.0) / 3.0:
         code, cause = "field_scale", f"the magnetometer's readings are {best:.4g} times the field"
@@ -168,8 +170,8 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
             " magnetometer's scale is wrong)"
         )
         remedy = "Give moment_a_m2 as amplitudes in A m^2."
-    undone = _stronger(known.site, best) if code != "field_scale" else None
-    yield _explained(known, after, 1, code, cause, remedy, undone)
+    undone = _stronger(known.site, best) if code == "moment_units" else None
+    yield _explained(known, after, int(undone is None), code, cause, remedy, undone)
 
 
 def _stronger(site: Site, factor: float) -> Site:

@@ -113,6 +113,11 @@ def length_cause(words: str) -> tuple[str, str, str]:
     )
 
 
+def in_other_unit(site: Site, words: str) -> Site:
+    """Return a site whose positions were in one of `LENGTH_FACTORS`."""
+    return _every(site, partial(_placed, axes=LENGTH_FACTORS[words] * np.eye(3)))
+
+
 def left_handed() -> tuple[str, str, str]:
     """Return code, cause and remedy of axes of which one has the wrong sign."""
     return (
@@ -172,8 +177,8 @@ def _ways(site: Site) -> Iterator[Way]:
             "Give moment_a_m2 as amplitudes in A m^2.",
             _every(site, partial(scaled, factor=1.0 / factor)),
         )
-    for words, factor in LENGTH_FACTORS.items():
-        yield Way(*length_cause(words), _every(site, partial(_placed, axes=factor * np.eye(3))))
+    for words in LENGTH_FACTORS:
+        yield Way(*length_cause(words), in_other_unit(site, words))
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         yield Way(
             "angle_convention",
