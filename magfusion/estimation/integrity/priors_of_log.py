@@ -78,8 +78,8 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
     information, turn = np.linalg.eigh(by_tilt.T @ by_tilt)
     along = turn.T @ by_tilt.T @ residual
     gain = float(np.sum(along**2 / information))
-    left = float(residual @ residual) - gain
-    if gain + 2.0 * np.log(RARE) < LEAST_EVIDENCE or left > TOLERATED * len(residual):
+    remaining = float(residual @ residual) - gain
+    if gain + 2.0 * np.log(RARE) < LEAST_EVIDENCE or remaining > TOLERATED * len(residual):
         return None
     count = len(case.pose_cov)
     return ReleasedFault(
@@ -98,15 +98,15 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
 def _of_tilt(cause: ReleasedFault) -> Finding:
     size = np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0]
     tilt_deg = -np.rad2deg(TYPICAL_TILT * size)  # the step takes it back
-    sure = float(sigmas(cause.log_p))
+    significance = float(sigmas(cause.log_p))
     return Finding(
         TILT,
         "The log moves all beacons together, as gravity contradicts the vertical of the survey: it"
         f" is tilted by {tilt_deg[0]:+.2g} deg about x and {tilt_deg[1]:+.2g} deg about y"
-        f" ({sure:.0f} sigma). Rotate positions and attitudes of all beacons back: world z is the"
+        f" ({significance:.0f} sigma). Rotate positions and attitudes of all beacons back: world z is the"
         " plumb line.",
         Verdict.DOUBTFUL,
-        sure,
+        significance,
     )
 
 
