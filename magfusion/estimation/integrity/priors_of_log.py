@@ -103,8 +103,8 @@ def _of_tilt(cause: ReleasedFault) -> Finding:
         TILT,
         "The log moves all beacons together, as gravity contradicts the vertical of the survey: it"
         f" is tilted by {tilt_deg[0]:+.2g} deg about x and {tilt_deg[1]:+.2g} deg about y"
-        f" ({significance:.0f} sigma). Rotate positions and attitudes of all beacons back: world z is the"
-        " plumb line.",
+        f" ({significance:.0f} sigma). Rotate positions and attitudes of all beacons back: world z"
+        " is the plumb line.",
         Verdict.DOUBTFUL,
         significance,
     )
