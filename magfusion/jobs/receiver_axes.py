@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from magfusion.errors import InputError
 from magfusion.files.fields import refuse_unsigned
 from magfusion.model.samples import Log
@@ -17,8 +15,7 @@ def check_axes(
     """Reject components other than those of the site's receiver, or unsupported by a job."""
     sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
     if fields is not None:
-        known = dict(zip(site.channels, site.tone_frequencies_hz, strict=True))
-        frequencies = np.array([known.get(channel, 0.0) for channel in fields.channels])
+        frequencies = site.frequencies_of(fields.channels)
         refuse_unsigned(fields, frequencies, log_path)
     measured = {stream.axes for stream in (fields, wave) if stream is not None}
     amplitude = fields is not None and not fields.signed

@@ -1,6 +1,6 @@
 """The site: beacons, the moving platform, and the uncertainty of their calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -212,6 +212,15 @@ class Site:
     def tone_frequencies_hz(self) -> Array:
         """Frequency of each channel of a magnetometer (Hz)."""
         return np.concatenate([beacon.tone_frequencies_hz for beacon in self.beacons])
+
+    def frequencies_of(self, channels: Sequence[tuple[str, int]]) -> Array:
+        """Return the frequency of some channels (Hz); zero where the site has none of that name."""
+        known = {
+            (beacon.name, tone): frequency_hz
+            for beacon in self.beacons
+            for tone, frequency_hz in enumerate(beacon.tone_frequencies_hz)
+        }
+        return np.array([known.get(channel, 0.0) for channel in channels])
 
     @cached_property
     def owner(self) -> IntArray:

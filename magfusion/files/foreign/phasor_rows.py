@@ -86,8 +86,7 @@ def _frequencies(plan: PhasorPlan, channels: tuple[Channel, ...]) -> Array:
     levels = AMBIENT in plan.coils or "slot" in plan.terms or plan.frame > 0
     if plan.site is None:
         return np.full(len(channels), 0.0 if levels else 1.0)
-    known = dict(zip(plan.site.channels, plan.site.tone_frequencies_hz, strict=True))
-    return np.array([known.get(channel, 0.0) for channel in channels])
+    return plan.site.frequencies_of(channels)
 
 
 def is_signed(path: Path) -> bool:
