@@ -191,6 +191,7 @@ _GAP = ("gap", "samples_lost")
 _JUMP = ("changed", "time_offset", "epoch_shift", "gap", "restarts", "imu_clock")
 _STEP = (
     "changed",
+    "range_switched",
     "gain_step",
     "magnetometer_matrix",
     "field_scale",

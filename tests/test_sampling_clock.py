@@ -336,3 +336,14 @@ def test_jitter_of_a_step_is_no_loss(scatter: float) -> None:
     part = stamps[rng.random(COUNT) > 0.02]
     lossy = sampling_clock(part)
     assert lossy is None or lossy.lost_count > 0
+
+
+@pytest.mark.parametrize("scatter", [0.1, 0.25, 0.3])
+def test_one_lost_sample_shows_in_jitter_of_a_third_of_a_step(scatter: float) -> None:
+    rng = np.random.default_rng(2)
+    tick = np.delete(np.arange(COUNT), 2000)
+    stamps = np.sort(STEP * (tick + scatter * rng.standard_normal(len(tick))))
+    clock = sampling_clock(stamps)
+    assert clock is not None
+    assert clock.lost_count == 1
+    assert np.max(np.abs(clock.time - STEP * tick)) < 0.1 * STEP

@@ -119,6 +119,7 @@ CODES = {
     "phase_units": "the drive phases are in another unit",
     "prior": "a calibration changed by more than the site's sigmas allow",
     "quantised": "the steps of an instrument are larger than its noise",
+    "range_switched": "the range or gain of the magnetometer changes during the log",
     "reference_hears": "the reference sensor receives a beacon, or may",
     "reference_unused": "the reference sensor does not reduce the noise, or is not used",
     "region_edge": "a pose is too near the edge of its region to exclude its mirror image",

@@ -26,7 +26,7 @@ MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
 MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
 MAX_DELAY = 32  # steps, by which a host delivers late
-LARGE_JITTER = 0.3  # of a step, standard deviation of steps from which a tick may be mistaken
+LARGE_JITTER = 0.45  # of a step, standard deviation of steps from which a tick may be mistaken
 OWN_JITTER = 0.7  # correlation of neighbours below which samples are late each by itself; sorting
 # stamps that scatter by a step correlates them by about a half
 ACCUMULATED = 1.2  # times the scatter within a piece, that losses leave in a longer one

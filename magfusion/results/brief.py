@@ -104,7 +104,8 @@ def next_step(figures: Figures, output: Path | None) -> str:
         return ""
     look = look_of(str(figures.get("verdict", Verdict.TRUSTWORTHY)))
     text = _NEXT_OF.get((str(figures.get("job")), look), _NEXT[look])
-    if any(CORRECTED in str(one["text"]) for one in findings(figures, "reasons")):
+    corrected = any(CORRECTED in str(one["text"]) for one in findings(figures, "reasons"))
+    if corrected and look is Verdict.DOUBTFUL:
         text = _AFTER_CORRECTION
     return text.format(output=output) if output is not None or "{output}" not in text else ""
 

@@ -144,7 +144,7 @@ def _steady_findings(
     if not iron or not result:
         return [*result, *iron]
     remaining = {finding.code for finding in others(calibrated(means, site))}
-    if "mounting" in remaining:  # with another one, the iron is another, or none
+    if remaining & {"magnetometer_axes", "mounting"}:  # with others, the iron is another, or none
         return result
     explained = tuple(sorted({finding.code for finding in result} - remaining))
     kept = [finding for finding in result if finding.code in remaining]

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from magfusion.model.samples import Log, Waveform
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.slots import has_schedule
@@ -14,7 +14,7 @@ BLOCK = 0.25  # s; longer than a period of the tones, shorter than most turns
 NEAR = 8  # blocks on either side, of which the static field is compared
 LEAST_STEP = 0.25  # of the logarithm of the gain; ranges of instruments differ by more
 LEAST_TONES = 0.25  # of the step, by which tones step as well; motion changes them meanwhile
-WEIGHT = 1e7  # before the parameters that seem to change then, which it explains
+NO_FIELD = 1e-15  # T; below any instrument, to keep logarithms finite
 CERTAIN = 6.0  # times the scatter of the static field on either side
 
 
@@ -23,32 +23,31 @@ def range_step(log: Log, site: Site | None) -> Iterator[Finding]:
     wave = log.vectors
     if wave is None or len(wave) < 2 or (site is not None and has_schedule(site)):
         return  # coils driven in turn change the size of the tones, too
-    time, static, tones = _blocks(wave)
-    if len(time) < 2 * NEAR + 2 or not np.all((static > 0.0) & (tones > 0.0)):
+    size = max(round(BLOCK / float(np.median(np.diff(wave.time)))), 2)
+    count = len(wave) // size
+    if count < 2 * NEAR + 2:
         return
-    level, of_tones = np.log(static), np.log(tones)
+    field = wave.measured_sensor[: count * size].reshape(count, size, 3)
+    level = np.log(np.maximum(np.linalg.norm(np.mean(field, axis=1), axis=1), NO_FIELD))
     at = NEAR + int(np.argmax(np.abs(level[NEAR + 1 : -NEAR] - level[NEAR - 1 : -NEAR - 2])))
     before, after = level[at - NEAR : at], level[at + 1 : at + 1 + NEAR]
     step = float(np.median(after) - np.median(before))
+    of_tones = np.log(max(_tones(field[at + 1]), NO_FIELD) / max(_tones(field[at - 1]), NO_FIELD))
     if (
         abs(step) > max(LEAST_STEP, CERTAIN * float(max(np.std(before), np.std(after))))
-        and (of_tones[at + 1] - of_tones[at - 1]) / step > LEAST_TONES
+        and of_tones / step > LEAST_TONES
     ):
+        time = float(np.mean(wave.time[at * size : (at + 1) * size]))
         yield Finding(
-            "changed",
+            "range_switched",
             f"magnetometer: all its readings change by a factor of {np.exp(step):.3g} at"
-            f" {time[at]:.4g} s: its range or gain was switched. Process the parts before and after"
-            f" separately (--end {time[at] - BLOCK:.4g}, --start {time[at] + BLOCK:.4g}).",
+            f" {time:.4g} s: its range or gain was switched. Process the parts before and after"
+            f" separately (--end {time - BLOCK:.4g}, --start {time + BLOCK:.4g}).",
             Verdict.FAILED,
-            weight=WEIGHT,
+            1e3,
         )
 
 
-def _blocks(wave: Waveform) -> tuple[Array, Array, Array]:
-    """Return time (s), static field (T) and size of the tones (T) of blocks, each (n,)."""
-    size = max(round(BLOCK / float(np.median(np.diff(wave.time)))), 2)
-    count = len(wave.time) // size
-    field = wave.measured_sensor[: count * size].reshape(count, size, 3)
-    time = wave.time[: count * size].reshape(count, size)
-    tones = np.sqrt(np.mean(np.sum(np.diff(field, axis=1) ** 2, axis=2), axis=1))
-    return np.mean(time, axis=1), np.linalg.norm(np.mean(field, axis=1), axis=1), tones
+def _tones(field_sensor: Array) -> float:
+    """Return the size of alternating fields of a block (T), by the differences of its samples."""
+    return float(np.sqrt(np.mean(np.sum(np.diff(field_sensor, axis=0) ** 2, axis=1))))

@@ -13,6 +13,7 @@ from magfusion.estimation.data_checks.turning import (
     FieldRotation,
     axes,
     field_body,
+    rotation_in,
     turning,
 )
 from magfusion.model.samples import Log
@@ -71,13 +72,8 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
 
 def left_handed_field(log: Log, site: Site) -> Finding | None:
     """Return the axes of the magnetometer that are reversed, whatever its hard iron is."""
-    if log.vectors is None or len(log.imu) < 2:
-        return None
-    lag = site.platform.imu.time_offset
-    rotation = turning(log.imu, log.vectors.time, field_body(log, site), lag)
-    if len(rotation.change) < 12 or not rotation.speed > LEAST_TURN:
-        return None
-    return _left_handed(log, site, rotation)
+    rotation = rotation_in(log, site)
+    return None if rotation is None else _left_handed(log, site, rotation)
 
 
 def _left_handed(log: Log, site: Site, rotation: FieldRotation) -> Finding | None:
@@ -99,13 +95,13 @@ def _left_handed(log: Log, site: Site, rotation: FieldRotation) -> Finding | Non
     force = [np.interp(log.vectors.time, time, axis) for axis in log.imu.accel_body.T]
     centred = field - offset * float(np.median(np.linalg.norm(field, axis=1)))
     upward = float(np.mean(np.sum(np.stack(force, axis=1) * (centred @ turns[best]), axis=1)))
-    if upward * earth[2] > 0.0:  # rightly turned: a mounting
+    if upward * earth[2] > 0.0:  # a mounting by half a turn
         return None
     wrong = ", ".join(
         a for a, sign in zip("xyz", np.diagonal(turns[best]), strict=True) if sign > 0
     )
     return Finding(
-        "mounting",
+        "magnetometer_axes",
         f"magnetometer: its axes are left-handed: {_words(rotation)}, and {_percent(share)} with"
         f" the sign of {wrong} (body axes) reversed. Correct the driver.",
         Verdict.FAILED,

@@ -170,13 +170,17 @@ def field_body(log: Log, site: Site | None) -> Array:
 
 def agrees(log: Log, site: Site) -> bool:
     """Return whether the body rotates, and the gyroscope explains it as declared."""
+    result = rotation_in(log, site)
+    return result is not None and result.explained(np.eye(3)) > CONTRADICTED
+
+
+def rotation_in(log: Log, site: Site) -> FieldRotation | None:
+    """Return the rotation of a log's static field; None where it is not measured or too small."""
     if log.vectors is None or len(log.imu) < 2:
-        return False
+        return None
     offset = site.platform.imu.time_offset
     result = turning(log.imu, log.vectors.time, field_body(log, site), offset)
-    if len(result.change) < 12 or not result.speed > LEAST_TURN:
-        return False
-    return result.explained(np.eye(3)) > CONTRADICTED
+    return result if len(result.change) >= 12 and result.speed > LEAST_TURN else None
 
 
 def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:

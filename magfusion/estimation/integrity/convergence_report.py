@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist
 
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
@@ -103,26 +103,30 @@ def geometry(case: Case) -> TestResult:
     return TestResult((Finding("geometry", text, verdict, weight),))
 
 
-def with_width(trust: Trust, site: Site, pose_cov: Array) -> Trust:
+def with_width(trust: Trust, site: Site, position_world: Array, pose_cov: Array) -> Trust:
     """Return the findings, of which the first fails a result as uncertain as the site is large.
 
     Parameters
     ----------
+    position_world : ndarray, shape (n, 3)
+        Far from all beacons, their distance counts (m).
     pose_cov : ndarray, shape (n, 6, 6)
         Final, of rotation and position, body axes (rad^2, rad m, m^2).
     """
+    if not trust.reasons or not site.beacons:
+        return trust
     rotation, position = (
         float(np.sqrt(np.median(np.trace(pose_cov[:, part, part], axis1=1, axis2=2)) / 3.0))
         for part in (slice(0, 3), slice(3, 6))
     )
     places = np.array([beacon.position_world for beacon in site.beacons])
-    size = float(np.max(pdist(places))) if len(places) > 1 else np.inf
-    if not trust.reasons or (position < size and rotation < ANY_ATTITUDE):
+    away = float(np.median(np.min(cdist(position_world, places), axis=1)))
+    if position < max(float(np.max(cdist(places, places))), away) and rotation < ANY_ATTITUDE:
         return trust
     first = trust.reasons[0]
     text = (
-        f"{first.text} The result is useless: its sigma is {position:.2g} m and"
-        f" {rotation / DEGREE:.2g} deg an axis."
+        f"{first.text} The result has a sigma of {position:.2g} m and {rotation / DEGREE:.2g} deg"
+        " an axis, which is none."
     )
     failed = replace(first, text=text, verdict=Verdict.FAILED)
     findings = (failed if finding is first else finding for finding in trust.findings)

@@ -29,6 +29,7 @@ OF_SAMPLES = {
     "frozen_imu",
     "frozen_magnetometer",
     "imu_spikes",
+    "range_switched",
     "repeated_samples",
     "saturated",
     "streams_apart",
@@ -37,8 +38,8 @@ OF_SAMPLES = {
 # What the streams show themselves, which comes before what follows of it.
 # What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
 OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
-# Of these a sensor measures nothing, and whatever follows is of that.
-NOT_MEASURED = {"frozen_imu", "frozen_magnetometer", "saturated", "stuck_axis"}
+# Of these a sensor measures nothing, or in another unit, and whatever follows is of that.
+NOT_MEASURED = {"frozen_imu", "frozen_magnetometer", "range_switched", "saturated", "stuck_axis"}
 # What follows of a field that is not as declared, wherever it comes from.
 OF_FIELDS = {
     "beacon_excluded",
@@ -56,7 +57,7 @@ SEEN = OF_SAMPLES | {
     "silent_beacon",
     "undeclared_line",
 }
-# As what a compass shows some mistakes, beside themselves.
+# Codes as which gravity, field and gyroscope show a mistake, besides its own.
 SHOWN_BY = {"accel_units": ("gravity_missing",), "imu_axes": ("gyro_sign", "gravity_sign")}
 CLEAR = 30.0  # ratio of chi square
 CAUSE_FIRST = 1e6  # weight: a cause comes before what it causes
@@ -212,8 +213,9 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     # What only says where something is wrong explains no more than what follows of it there.
     every = first.code in NOT_MEASURED or (cause is not None and first.weight >= CAUSE_FIRST)
 
-    # Where hardly anything is left, no parameter has changed during the log.
-    seen = SEEN - {"changed"} if cause is not None and cause.is_clear else SEEN
+    # Where hardly anything is left, or one instrument's range, no parameter has changed in the log.
+    is_clear = first.code == "range_switched" or (cause is not None and cause.is_clear)
+    seen = SEEN - {"changed"} if is_clear else SEEN
 
     def is_explained(finding: Finding) -> bool:
         doubts = finding.verdict is not Verdict.TRUSTWORTHY and finding is not first

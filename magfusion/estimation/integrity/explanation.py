@@ -13,9 +13,9 @@ CLEARLY = 2.5  # times smaller than before must chi square be, and than with any
 SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
 PENALTY = 6.0  # of chi square, for each parameter that is found
 ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
-# Or what is left is little of chi square before, as survey errors are more than noise: of a gross
-# mistake so much, of any other not more than errors twice as large as declared leave.
-LITTLE, VERY_LITTLE, MOST_LEFT = 0.04, 0.004, 4.0
+# Survey errors may leave more than noise: this share of chi square before, but not more than errors
+# twice as large as declared (in chi square, times expected), or this share of a gross mistake's.
+LITTLE, MOST_LEFT, VERY_LITTLE = 0.04, 4.0, 0.004
 ALIKE = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
@@ -60,9 +60,9 @@ class Explanation:
     @property
     def clear(self) -> bool:
         """Whether it explains so much that it is worth saying."""
-        little = min(LITTLE * self.before, MOST_LEFT * self.expected)
-        little = max(ENOUGH * self.expected, VERY_LITTLE * self.before, little)
-        enough = self.after < little
+        by_survey = min(LITTLE * self.before, MOST_LEFT * self.expected)
+        by_noise, of_gross = ENOUGH * self.expected, VERY_LITTLE * self.before
+        enough = self.after < max(by_noise, by_survey, of_gross)
         # A bias or a lever arm that its prior holds back costs little, however sure it is.
         noise = max(self.after / max(self.expected, 1.0), 1e-9)
         significant = self.found > 0 and self.fall / self.found > SIGNIFICANT * noise
@@ -70,7 +70,7 @@ class Explanation:
         return enough and self.fall > LEAST_FALL and clearly
 
     def as_well_as(self, other: "Explanation") -> bool:
-        """Return whether it leaves hardly more than another, or no more than noise."""
+        """Return whether it leaves hardly more than another, or no more than is expected."""
         return self.after < max(ALIKE * other.after + LEAST_FALL / 2.0, self.expected)
 
     def rivalled_by(self, other: "Explanation") -> bool:
@@ -84,7 +84,7 @@ class Explanation:
         cause = self.cause[:1].upper() + self.cause[1:]
         return (
             f"{cause}. With that, the chi square of {of} falls from {self.before:.4g} to"
-            f" {self.after:.3g} (limit {self.expected:.3g}). {self.remedy}"
+            f" {self.after:.3g} (at most {self.expected:.3g} expected). {self.remedy}"
         )
 
 

@@ -14,7 +14,7 @@ from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.data_checks.signal import detected_in
 from magfusion.estimation.graph.graph import GraphEstimate
-from magfusion.estimation.integrity.change_detection import CHANGED, candidate_steps, changed
+from magfusion.estimation.integrity.change_detection import candidate_steps, changed
 from magfusion.estimation.integrity.convergence_report import (
     convergence,
     geometry,
@@ -114,19 +114,17 @@ def judged_with_score(result: R, log: Log, online: Site | None = None) -> Judged
     score, wide = (None, None) if scores is None else scores
     in_region = None if online is None else score_with_steel(score, result, log, online)
     case = Case(result, log, score, pose_cov, wide, in_region)
-    switched = any(finding.code == CHANGED for finding in detected)  # as all beacons seem to
     factor, spread = np.ones(len(pose_cov)), np.zeros_like(pose_cov)
     causes: tuple[ReleasedFault, ...] = ()
     for findings in _run_tests(case):
         causes = causes or (findings.causes if findings.findings else ())
-        named = tuple(f for f in findings.findings if not (switched and f.code == CHANGED))
-        trust |= Trust(named, findings.unverified)
+        trust |= Trust(findings.findings, findings.unverified)
         factor = factor if findings.factor is None else np.maximum(factor, findings.factor)
         spread = spread if findings.spread is None else spread + findings.spread
     final_cov = factor[:, None, None] * pose_cov + spread
     widened = replace(result.states, pose_cov=final_cov)
     if online is None:
-        trust = with_width(trust, result.declared.site, final_cov)
+        trust = with_width(trust, result.declared.site, at.position_world, final_cov)
     score = score if in_region is None else in_region
     return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
 

@@ -70,19 +70,15 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
     if not site.platform.inertial or len(surveyed) < max(2 * len(site.beacons), 1):
         return None
     tilt = survey_tilt(site, surveyed, len(change))
-    value, vector = np.linalg.eigh(0.5 * (cov + cov.T))
-    whiten = vector[:, value > MIN_INFORMATION_RATIO] / np.sqrt(
-        value[value > MIN_INFORMATION_RATIO]
-    )
+    whiten = _whitening(cov)
     residual, by_tilt = whiten.T @ change, whiten.T @ tilt
     information, turn = np.linalg.eigh(by_tilt.T @ by_tilt)
+    if information[0] < 1.0:  # a typical tilt moves nothing by its sigma
+        return None
     along = turn.T @ by_tilt.T @ residual
     gain = float(np.sum(along**2 / information))
-    remaining = float(residual @ residual) - gain
-    if gain + 2.0 * np.log(RARE) < LEAST_EVIDENCE or remaining > TOLERATED * len(residual):
-        return None
     count = len(case.pose_cov)
-    return ReleasedFault(
+    cause = ReleasedFault(
         Suspect("the vertical of the survey", surveyed, tilt, TILT, RARE),
         step=tilt @ turn @ (along / information),
         direction=tilt @ turn,
@@ -93,6 +89,15 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
         moved=np.zeros((count, 6)),  # the result has moved the beacons
         distance=np.zeros(count),
     )
+    explains_all = float(residual @ residual) - gain < TOLERATED * len(residual)
+    return cause if explains_all and cause.posterior_gain > LEAST_EVIDENCE else None
+
+
+def _whitening(cov: Array) -> Array:
+    """Return the directions with information, (n, k), by which a change has unit covariance."""
+    value, vector = np.linalg.eigh(0.5 * (cov + cov.T))
+    known = value > MIN_INFORMATION_RATIO
+    return np.asarray(vector[:, known] / np.sqrt(value[known]))
 
 
 def _of_tilt(cause: ReleasedFault) -> Finding:
@@ -152,13 +157,11 @@ def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int
     directions below `MIN_INFORMATION_RATIO` are ignored.
     """
     rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
-    own = cov[np.ix_(rows, rows)]
-    value, vector = np.linalg.eigh(0.5 * (own + own.T))
-    findings = value > MIN_INFORMATION_RATIO
-    if not np.any(findings):
+    whiten = _whitening(cov[np.ix_(rows, rows)])
+    freedom = whiten.shape[1]
+    if not freedom:
         return 0.0, 1, 0.0
-    square = float(np.sum((vector[:, findings].T @ change[rows]) ** 2 / value[findings]))
-    freedom = int(np.sum(findings))
+    square = float(np.sum((whiten.T @ change[rows]) ** 2))
     return square, freedom, float(log_p_chi_square(square, freedom))
 
 

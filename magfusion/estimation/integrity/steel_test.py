@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import pdist
 from scipy.special import logsumexp
 
 from magfusion.estimation.batch.batch import Smoothed
@@ -276,18 +275,17 @@ def amplitudes(score: Score, sigma: Array) -> tuple[Array, Array]:
 
 
 def _strongest(modes: SteelBasis, mean: Array, cov: Array) -> tuple[Array, float]:
-    """Return the place of the largest polarisability over draws of amplitudes, and its sigma.
-
-    The place is not known better than to a voxel, here the distance of the nearest two.
-    """
+    """Return the place of the largest polarisability over draws of amplitudes, and its sigma."""
     root = np.linalg.cholesky(cov + 1e-12 * np.eye(len(cov)))
     noise = np.random.default_rng(0).standard_normal((len(mean), DRAWS))
     each = np.abs(modes.polarisability @ (mean[:, None] + root @ noise))
     strength = np.sqrt(np.mean(np.sum(each**2, axis=2), axis=1))  # (v, draws)
-    centre = modes.voxels.centre_world
-    places = centre[np.argmax(strength, axis=0)]
-    place, size = np.mean(places, axis=0), float(np.min(pdist(centre))) if len(centre) > 1 else 0.0
-    return place, float(np.hypot(size, np.sqrt(np.mean(np.sum((places - place) ** 2, axis=1)))))
+    strongest = np.argmax(strength, axis=0)
+    places, edge = modes.voxels.centre_world[strongest], modes.voxels.edge[strongest]
+    place = np.mean(places, axis=0)
+    # Anywhere in a cube, three components have a variance of a quarter of its edge squared.
+    variance = np.mean(np.sum((places - place) ** 2, axis=1) + 0.25 * edge**2)
+    return place, float(np.sqrt(variance))
 
 
 def _rounded_up(value: float) -> float:
