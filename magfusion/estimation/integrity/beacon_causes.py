@@ -217,10 +217,9 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
     yield from rewired
     if any(one.clear for one in rewired):
         return  # to turn the beacon over, or its phase, says the same in other words
-    yield from coil_phase(known, beacon, trial)
     after, found = known.fitted([(LOG_MOMENT, name, WIDE[2])], fixes)
     factors = np.exp(LOG_MOMENT.difference(known.calibration, found, name))
-    yield _explained(
+    moments = _explained(
         known,
         after,
         len(factors),
@@ -229,6 +228,9 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
         f"Measure the current of beacon {name}, or calibrate it (magfusion calibrate beacon).",
         found.site,
     )
+    yield moments
+    if not moments.clear:
+        yield from coil_phase(known, beacon, trial)
     if beacon.synchronised:
         after, found = known.fitted([(PHASE, name, WIDE[3])], fixes)
         lag = PHASE.difference(known.calibration, found, name) / DEGREE

@@ -251,7 +251,7 @@ def _exchanges(site: Site) -> Iterator[Way]:
     for order in orders:
         names = _listed([site.beacons[k].name for k in order])
         ways = {f"beacons {names} are exchanged (or their frequencies are)": pose}
-        if len({_kind_of_coils(site.beacons[k]) for k in order}) == 1:
+        if _differ_in_moments([site.beacons[k] for k in order]):
             ways[f"the frequencies of beacons {names} are exchanged"] = (*pose, "coils")
         if len(order) == 2:
             ways[f"the positions of beacons {names} are exchanged"] = pose[:1]
@@ -271,9 +271,13 @@ def _exchanges(site: Site) -> Iterator[Way]:
             )
 
 
-def _kind_of_coils(beacon: Beacon) -> tuple[tuple[float | None, int | None], ...]:
-    """Return by what the tones of coils differ, beside the beacon's frequency."""
-    return tuple((coil.frequency_hz, coil.slot) for coil in beacon.coils)
+def _differ_in_moments(beacons: Sequence[Beacon]) -> bool:
+    """Return whether coils of beacons have other moments, at tones that differ alike."""
+    kinds = {tuple((coil.frequency_hz, coil.slot) for coil in one.coils) for one in beacons}
+    first, *others = beacons
+    return len(kinds) == 1 and any(
+        not np.array_equal(first.moments_beacon, other.moments_beacon) for other in others
+    )
 
 
 def _listed(names: Sequence[str]) -> str:
