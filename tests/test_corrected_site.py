@@ -13,8 +13,10 @@ from magfusion.estimation.integrity.corrected_site import (
 )
 from magfusion.estimation.integrity.correction import Correction, released
 from magfusion.estimation.integrity.suspects import (
+    EPOCH_SHIFT,
     SAMPLE_RATE,
     TILT,
+    TYPICAL_SHIFT,
     TYPICAL_TILT,
     held_blocks,
     suspects,
@@ -166,3 +168,14 @@ def test_gravity_that_was_removed_is_declared_as_nearly_none() -> None:
     fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter is GRAVITY)
     corrected = corrected_site(SITE, fault, fault.combine @ np.array([-981.0]))  # of 0.01 m/s^2
     assert changed_keys(SITE, corrected) == {"world.gravity_m_s2": NO_GRAVITY}
+
+
+def test_a_shift_of_the_epoch_turns_each_tone_by_its_frequency() -> None:
+    fault = next(one for one in suspects(SITE, FIXED) if one.code == EPOCH_SHIFT)
+    delay = 0.4e-3  # s
+    shifted = corrected_site(SITE, fault, fault.combine @ [delay / TYPICAL_SHIFT])
+    for before, after in zip(SITE.beacons, shifted.beacons, strict=True):
+        for coil, later in zip(before.coils, after.coils, strict=True):
+            frequency_hz = coil.frequency_hz or before.frequency_hz
+            turned = 2.0 * np.pi * frequency_hz * delay
+            np.testing.assert_allclose(later.phase - coil.phase, turned, rtol=1e-9)

@@ -15,7 +15,6 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.results.association import associate
 from magfusion.results.figures import Figure, Figures, Section
-from magfusion.results.truth_frame import frame_remarks, unit_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +57,7 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.jobs.inputs import named
     from magfusion.results.errors import trajectory_errors
     from magfusion.results.report import error_figures
+    from magfusion.results.truth_frame import frame_remarks, unit_text
 
     noticed: list[Finding] = []
     true, epoch_ns, remarks = _read_truth(settings, noticed)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.released_fault import ReleaseGain
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.suspects import (
     SAMPLE_RATE,
     STRETCH,
@@ -126,14 +126,15 @@ def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
     return site
 
 
-def corrected_by(site: Site, cause: ReleaseGain) -> Site:
+def corrected_by(site: Site, cause: ReleasedFault) -> Site:
     """Return a site with the parameters of a cause corrected.
 
-    Gravity levels what remains of a tilt about the middle of the beacons, which the correction
-    moves about the origin: that is added to the sigmas of those whose positions are estimated.
+    Where the estimated positions of beacons have shown a tilt, gravity levels what remains of it
+    about the middle of the beacons, which the correction moves about the origin: that is added to
+    the sigmas of the positions.
     """
     result = corrected_site(site, cause.fault, cause.step)
-    if cause.fault.code != TILT:
+    if cause.fault.code != TILT or cause.moved.any():
         return result
     back = np.linalg.pinv(cause.fault.combine)
     tilt_cov = np.zeros((3, 3))

@@ -15,9 +15,11 @@ from magfusion.estimation.data_checks.statistics import sigmas
 from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
 from magfusion.estimation.integrity.suspects import (
+    EPOCH_SHIFT,
     SAMPLE_RATE,
     STRETCH,
     TILT,
+    TYPICAL_SHIFT,
     TYPICAL_TILT,
     Suspect,
     suspects,
@@ -171,6 +173,13 @@ def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault]
         fast = -1e6 * float((block.sigma * cause.step[block.columns])[0])
         result = f"the stamps run {fast:+.3g} ppm fast against the drives"
         remedy = "Check the sample rate with which the stamps were made"
+    elif cause.fault.code == EPOCH_SHIFT:
+        late = float(np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0][0])
+        # A field that is sampled before its stamp has the phase of an earlier time.
+        side = "early" if late > 0.0 else "late"
+        shift_ms = 1e3 * TYPICAL_SHIFT * abs(late)
+        result = f"all stamps are {shift_ms:.3g} ms {side} against it"
+        remedy = "Correct epoch_ns of the log, or the delay of the magnetometer's stamps"
     elif len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
         block = cause.fault.blocks[0]
         factor = float(np.exp(block.sigma * cause.step[block.columns])[0])

@@ -151,7 +151,8 @@ CODE: dict[Parameter, str] = {
 
 LEVER_ARM = "the lever arm of the magnetometer"
 TILT, STRETCH, SAMPLE_RATE = "survey_tilt", "survey_scale", "sample_rate"
-FIELD_SCALE = "field_scale"
+FIELD_SCALE, EPOCH_SHIFT = "field_scale", "epoch_shift"
+TYPICAL_SHIFT = 1e-3  # s, of stamps against the drives: a driver's or a bus's delay
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
 # seldom tilted, and gyros seldom are that bad.
 RARE = 0.1
@@ -250,6 +251,24 @@ def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]
             for block in own:
                 common[block.columns] = 1.0
             yield Suspect(name, own, common, code)
+    phases = tuple(block for block in held if block.parameter == PHASE)
+    if len(phases) > 1:
+        yield Suspect(
+            "the epoch of the drive phases", phases, epoch_shift(site, phases, size), EPOCH_SHIFT
+        )
+
+
+def epoch_shift(site: Site, phases: tuple[Block, ...], size: int) -> Array:
+    """Return the effect on all drive phases of stamps that are late, shape (size, 1).
+
+    A unit is a typical delay, `TYPICAL_SHIFT`.
+    """
+    out = np.zeros((size, 1))
+    beacons = {beacon.name: beacon for beacon in site.beacons}
+    for block in phases:
+        turns = 2.0 * np.pi * beacons[block.owner].tone_frequencies_hz
+        out[block.columns, 0] = turns * TYPICAL_SHIFT / block.sigma
+    return out
 
 
 def survey_tilt(site: Site, surveyed: tuple[Block, ...], size: int) -> Array:
