@@ -13,8 +13,8 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, fitted_iron
 from magfusion.estimation.data_checks.data_quality import recorded
+from magfusion.estimation.data_checks.gyro_field_consistency import left_handed_field
 from magfusion.estimation.data_checks.still_means import still_means
-from magfusion.estimation.data_checks.turn_witness import left_handed_field
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.magnetometer_trust import calibrated as calibrate_magnetometer

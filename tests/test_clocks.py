@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magfusion.estimation.data_checks.turning import LAG_STEP, LONGEST_LAG, Clocks
+from magfusion.estimation.data_checks.field_rotation import LAG_STEP, LONGEST_LAG, Clocks
 from magfusion.model.samples import ImuSamples, Log, Waveform
 
 LATE = 0.14  # s

@@ -14,7 +14,7 @@ from magfusion.estimation.data_checks.samples import (
     false_samples,
     frozen_samples,
 )
-from magfusion.estimation.integrity.likely_cause import cause_of
+from magfusion.estimation.integrity.hypothesis_tests import cause_of
 from magfusion.estimation.integrity.quick_check import quick_check
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from magfusion.estimation.data_checks.turning import convolved
+from magfusion.estimation.data_checks.field_rotation import convolved
 
 
 @pytest.mark.parametrize(

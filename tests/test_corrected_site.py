@@ -12,14 +12,14 @@ from magfusion.estimation.integrity.corrected_site import (
     with_intrinsics,
 )
 from magfusion.estimation.integrity.correction import Correction, released
-from magfusion.estimation.integrity.suspects import (
+from magfusion.estimation.integrity.fault_candidates import (
     EPOCH_SHIFT,
     SAMPLE_RATE,
     TILT,
     TYPICAL_SHIFT,
     TYPICAL_TILT,
-    held_blocks,
-    suspects,
+    fault_candidates,
+    fixed_blocks,
 )
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
@@ -35,7 +35,7 @@ from magfusion.model.trust import Finding
 from magfusion.simulation.demo_site import demo_site
 
 SITE = demo_site()
-FIXED = held_blocks(SITE, (), steady=True)
+FIXED = fixed_blocks(SITE, (), steady=True)
 KINDS = ("position", "rotation", "log_moment", "phase", "matrix")
 
 
@@ -44,7 +44,9 @@ def test_one_parameter_moves_fields_as_a_step_of_the_calibration_does(kind: str)
     rng = np.random.default_rng(3)
     time, place = np.zeros(4), rng.uniform([1.0, 0.5, 0.0], [3.0, 2.5, 2.0], (4, 3))
     turn = Rotation.random(4, rng=rng).as_matrix()
-    chosen = [f for f in suspects(SITE, FIXED) if len(f.blocks) == 1 and f.blocks[0].kind == kind]
+    chosen = [
+        f for f in fault_candidates(SITE, FIXED) if len(f.blocks) == 1 and f.blocks[0].kind == kind
+    ]
     assert chosen
     for fault in chosen:
         block = fault.blocks[0]
@@ -62,12 +64,12 @@ def test_one_parameter_moves_fields_as_a_step_of_the_calibration_does(kind: str)
 
 def test_each_fault_has_a_name_of_its_own() -> None:
     """A fault is recognised by its name in the solution that is corrected for another."""
-    names = [fault.name for fault in suspects(SITE, FIXED)]
+    names = [fault.name for fault in fault_candidates(SITE, FIXED)]
     assert len(set(names)) == len(names)
 
 
 def test_a_tilt_turns_places_and_attitudes_together() -> None:
-    fault = next(one for one in suspects(SITE, FIXED) if one.code == TILT)
+    fault = next(one for one in fault_candidates(SITE, FIXED) if one.code == TILT)
     tilted = corrected_site(SITE, fault, fault.combine @ (np.deg2rad([2.0, -1.0]) / TYPICAL_TILT))
     turn = Rotation.from_rotvec(np.deg2rad([2.0, -1.0, 0.0])).as_matrix()
     for before, after in zip(SITE.beacons, tilted.beacons, strict=True):
@@ -80,7 +82,7 @@ def test_a_tilt_turns_places_and_attitudes_together() -> None:
 def test_a_released_parameter_is_as_uncertain_as_it_was_wrong() -> None:
     """Unless the user has its group fixed; a survey's common errors are not released at all."""
     lever, tilt = (
-        next(one for one in suspects(SITE, FIXED) if one.finding_code == code)
+        next(one for one in fault_candidates(SITE, FIXED) if one.finding_code == code)
         for code in ("lever_arm", TILT)
     )
     (block,) = lever.blocks
@@ -130,7 +132,9 @@ def test_errors_of_an_imu_add_to_those_that_are_declared() -> None:
     rate, force = rng.standard_normal((2, 20, 3))
     site = with_intrinsics(SITE, g_sensitivity=1e-3 * rng.standard_normal((3, 3)))
     for kind in (GYRO_SCALE, GYRO_ALIGNMENT, GYRO_G_SENSITIVITY):
-        fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter == kind)
+        fault = next(
+            one for one in fault_candidates(SITE, FIXED) if one.blocks[0].parameter == kind
+        )
         step = np.zeros(FIXED[-1].columns.stop)
         step[fault.blocks[0].columns] = rng.standard_normal(fault.blocks[0].parameter.size)
         site = corrected_site(site, fault, step)
@@ -150,14 +154,16 @@ def test_a_key_that_goes_is_told_too() -> None:
 
 
 def test_a_bias_beyond_its_sigma_is_declared_to_be_so_uncertain() -> None:
-    fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter is GYRO_BIAS)
+    fault = next(
+        one for one in fault_candidates(SITE, FIXED) if one.blocks[0].parameter is GYRO_BIAS
+    )
     step = fault.combine @ np.array([1.0, -4.0, 0.0])  # of 0.01 rad/s
     corrected = corrected_site(SITE, fault, step)
     assert changed_keys(SITE, corrected) == {"platform.imu.gyro_bias_sigma": pytest.approx(0.04)}
 
 
 def test_drifts_of_all_beacons_alike_are_the_magnetometers_clock() -> None:
-    fault = next(one for one in suspects(SITE, FIXED) if one.code == SAMPLE_RATE)
+    fault = next(one for one in fault_candidates(SITE, FIXED) if one.code == SAMPLE_RATE)
     assert {block.owner for block in fault.blocks} == {beacon.name for beacon in SITE.beacons}
     corrected = corrected_site(SITE, fault, fault.combine @ np.array([20.0]))  # of 1 ppm
     changed = changed_keys(SITE, corrected)
@@ -165,13 +171,13 @@ def test_drifts_of_all_beacons_alike_are_the_magnetometers_clock() -> None:
 
 
 def test_gravity_that_was_removed_is_declared_as_nearly_none() -> None:
-    fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter is GRAVITY)
+    fault = next(one for one in fault_candidates(SITE, FIXED) if one.blocks[0].parameter is GRAVITY)
     corrected = corrected_site(SITE, fault, fault.combine @ np.array([-981.0]))  # of 0.01 m/s^2
     assert changed_keys(SITE, corrected) == {"world.gravity_m_s2": NO_GRAVITY}
 
 
 def test_a_shift_of_the_epoch_turns_each_tone_by_its_frequency() -> None:
-    fault = next(one for one in suspects(SITE, FIXED) if one.code == EPOCH_SHIFT)
+    fault = next(one for one in fault_candidates(SITE, FIXED) if one.code == EPOCH_SHIFT)
     delay = 0.4e-3  # s
     shifted = corrected_site(SITE, fault, fault.combine @ [delay / TYPICAL_SHIFT])
     for before, after in zip(SITE.beacons, shifted.beacons, strict=True):

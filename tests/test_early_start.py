@@ -16,7 +16,7 @@ from magfusion.estimation.initialization.early import (
 )
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.integrity.correction import Correction
-from magfusion.estimation.integrity.suspects import held_blocks, suspects
+from magfusion.estimation.integrity.fault_candidates import fault_candidates, fixed_blocks
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.judgement import Judgement
@@ -122,7 +122,7 @@ def test_a_checkpoint_before_a_start_has_the_reason_and_no_corrections() -> None
     site, settings = demo_site(), NavigatorSettings()
     navigator = Navigator(site, settings)
     finding = Finding("mounting", "It is turned.", Verdict.FAILED)
-    fault = next(suspects(site, held_blocks(site, (), steady=True)))
+    fault = next(fault_candidates(site, fixed_blocks(site, (), steady=True)))
     wrong = NoStart("It is turned.", Trust((finding,)), (Correction(finding, site, fault),))
     loop = navigator._loop
     assert loop.search.accepted(wrong, loop.arrived) is None

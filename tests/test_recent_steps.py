@@ -11,7 +11,7 @@ from test_smoothed_separation import EPOCHS, STEP, _walk
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.integrity.change_detection import StepChange
-from magfusion.estimation.integrity.diagnosis import with_changed_beacons
+from magfusion.estimation.integrity.fault_isolation import with_changed_beacons
 from magfusion.estimation.integrity.smoothed_exclusion import (
     TOGETHER,
     excluded_to_the_end,

@@ -9,8 +9,8 @@ from small_problem import small_log
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity import change_detection, fixed_parameter_columns, score
+from magfusion.estimation.integrity.fault_candidates import fixed_blocks
 from magfusion.estimation.integrity.score import Score, answered, scores_of
-from magfusion.estimation.integrity.suspects import held_blocks
 from magfusion.estimation.measurements import phasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior import block_tridiagonal_system, schur_complement
@@ -66,7 +66,7 @@ def test_of_many_columns_each_channel_whitens_those_that_it_feels(
     small = small_log(3)
     settings = SmootherSettings(tune=False)
     result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
-    blocks = placed((*held_blocks(result.declared.site, (), steady=False), *result.field_errors))
+    blocks = placed((*fixed_blocks(result.declared.site, (), steady=False), *result.field_errors))
     fields = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))
     at = states_in(result.estimate.values).rows(fields.epoch), result.calibration, blocks
     few = fields.linearize(*at).by_calibration

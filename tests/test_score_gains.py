@@ -1,4 +1,4 @@
-"""What every suspect would explain, asked of all at once."""
+"""What every candidate fault would explain, evaluated together."""
 
 import numpy as np
 import pytest

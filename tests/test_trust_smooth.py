@@ -17,9 +17,9 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.integrity.fault_candidates import CODE, fault_candidates, fixed_blocks
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.score import scores_of
-from magfusion.estimation.integrity.suspects import CODE, held_blocks, suspects
 from magfusion.model.parameters import LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site
@@ -199,13 +199,13 @@ def test_the_score_foretells_what_solving_again_finds() -> None:
 
 def test_everything_that_is_held_is_asked() -> None:
     _, site = a_log(1)
-    fixed = held_blocks(site, (), steady=False)
+    fixed = fixed_blocks(site, (), steady=False)
     kinds = {block.parameter for block in fixed}
     assert {LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION} <= kinds
     assert sum(b.parameter == LOG_MOMENT for b in fixed) == len(site.beacons)
-    requested = list(suspects(site, fixed))
+    requested = list(fault_candidates(site, fixed))
     assert len({s.name for s in requested}) >= len(fixed)
-    fewer = held_blocks(site, fixed[:3], steady=False)
+    fewer = fixed_blocks(site, fixed[:3], steady=False)
     assert {b.key for b in fewer} == {b.key for b in fixed[3:]}
 
 

@@ -11,7 +11,7 @@ from magfusion.estimation.integrity.correction import (
     best_trial,
     corrections,
 )
-from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.fault_isolation import Diagnosis
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.preintegration import preintegration_parameters
+from magfusion.estimation.integrity.fault_candidates import fault_candidates
 from magfusion.estimation.integrity.score import scores_of
-from magfusion.estimation.integrity.suspects import suspects
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.field import predict
@@ -116,7 +116,7 @@ def _gains(site: Site, declared: Site) -> dict[str, float]:
     assert scores is not None
     score = scores.fixed
     gains = {}
-    for fault in suspects(declared, score.fixed):
+    for fault in fault_candidates(declared, score.fixed):
         gradient = fault.combine.T @ score.gradient
         information = fault.combine.T @ score.information @ fault.combine
         degrees = fault.combine.shape[1]

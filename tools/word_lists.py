@@ -157,19 +157,6 @@ WHOLE_IDENTIFIERS = {
     "prior_ahead": "motion_prior_prediction",
 }
 
-# What one bank of hypotheses will replace: moved, and neither renamed nor rewritten before.
-LATER = (
-    "magfusion/estimation/data_checks/turn_witness.py",
-    "magfusion/estimation/integrity/beacon_causes.py",
-    "magfusion/estimation/integrity/diagnosis.py",
-    "magfusion/estimation/integrity/explanation.py",
-    "magfusion/estimation/integrity/field_causes.py",
-    "magfusion/estimation/integrity/likely_cause.py",
-    "magfusion/estimation/integrity/motion_causes.py",
-    "magfusion/estimation/integrity/phase_causes.py",
-    "magfusion/estimation/integrity/suspects.py",
-)
-
 # What stays, by "file: name or word", with the reason; at most 40.
 ALLOWED: dict[str, str] = {
     "magfusion/receiver/admission.py: stands": "a key of the report: why windows are dropped",

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from house import ROOT, nodes_of
-from word_lists import ALLOWED, IN_IDENTIFIERS, IN_TEXT, LATER, WHOLE_IDENTIFIERS
+from word_lists import ALLOWED, IN_IDENTIFIERS, IN_TEXT, WHOLE_IDENTIFIERS
 
 CODE = ("magfusion", "tools", "scenarios")
 PAGES = ("docs", "README.md", "CONTRIBUTING.md")
@@ -171,7 +171,7 @@ def _files(roots: Iterable[str], suffix: str) -> Iterator[Path]:
 
 
 def findings() -> list[Finding]:
-    """Return all of the checkout, what is allowed and what comes later among them."""
+    """Return all of the checkout, what is allowed among them."""
     out: list[Finding] = []
     for path in _files(CODE, ".py"):
         if path.stem not in ("words", "word_lists"):
@@ -183,8 +183,8 @@ def findings() -> list[Finding]:
 
 
 def open_findings(everything: Iterable[Finding]) -> list[Finding]:
-    """Return what is neither allowed nor replaced later."""
-    return [f for f in everything if f.place not in LATER and f.key not in ALLOWED]
+    """Return what is not allowed."""
+    return [f for f in everything if f.key not in ALLOWED]
 
 
 def main() -> int:
@@ -206,9 +206,8 @@ def main() -> int:
             name = "" if f.name == f.word else f" in {f.name}"
             print(f"{f.place}:{f.line}: {f.kind}: {f.word}{name}: {f.instead}")
     counts = Counter(f.kind for f in remaining)
-    later = sum(f.place in LATER for f in everything)
-    print(", ".join(f"{kind} {counts[kind]}" for kind in LISTS), f"(later: {later},", end=" ")
-    print(f"allowed: {len(ALLOWED)} of {MAX_ALLOWED})")
+    print(", ".join(f"{kind} {counts[kind]}" for kind in LISTS), end=" ")
+    print(f"(allowed: {len(ALLOWED)} of {MAX_ALLOWED})")
     return 1 if remaining or len(ALLOWED) > MAX_ALLOWED else 0
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from magfusion.calibration.magnetometer import field_from_measured, refined
 from magfusion.errors import EstimationError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.data_checks.gyro_field_consistency import left_handed_field
 from magfusion.estimation.data_checks.samples import clipped_samples
-from magfusion.estimation.data_checks.turn_witness import left_handed_field
 from magfusion.estimation.snapshot.priors import Contradiction, contradiction, trust_of
 from magfusion.model.samples import Log
 from magfusion.model.site import Magnetometer, Site

@@ -169,7 +169,7 @@ def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     """Return figures and verdict of a run, and its results if it has a state."""
-    from magfusion.estimation.integrity.diagnosis import diagnosed, with_explaining_cause
+    from magfusion.estimation.integrity.fault_isolation import diagnosed, with_explaining_cause
     from magfusion.jobs.navigate_results import navigated, no_start
 
     log, navigator = run.replay.log, run.navigator

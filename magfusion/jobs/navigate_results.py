@@ -11,13 +11,13 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.diagnosis import (
+from magfusion.estimation.integrity.fault_isolation import (
     CAUSE_FIRST,
     diagnosed,
     with_corrected,
     with_explaining_cause,
 )
-from magfusion.estimation.integrity.likely_cause import QUANTISED, coarse_steps
+from magfusion.estimation.integrity.hypothesis_tests import QUANTISED, coarse_steps
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site

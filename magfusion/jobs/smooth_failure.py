@@ -10,7 +10,7 @@ from magfusion.errors import UNOBSERVABLE
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
-from magfusion.estimation.integrity.diagnosis import (
+from magfusion.estimation.integrity.fault_isolation import (
     OF_CATCH_ALL,
     Diagnosis,
     diagnosed,

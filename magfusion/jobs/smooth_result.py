@@ -14,7 +14,7 @@ from magfusion.estimation.integrity.correction import (
     corrections,
     spread_with_rivals,
 )
-from magfusion.estimation.integrity.diagnosis import (
+from magfusion.estimation.integrity.fault_isolation import (
     diagnosed,
     with_changed_beacons,
     with_explaining_cause,

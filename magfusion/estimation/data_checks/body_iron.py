@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.field_rotation import CORRELATED
 from magfusion.estimation.data_checks.still_means import StillMeans
-from magfusion.estimation.data_checks.turning import CORRELATED
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict

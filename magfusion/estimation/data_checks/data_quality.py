@@ -8,6 +8,7 @@ import numpy as np
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, iron_on_body
 from magfusion.estimation.data_checks.disturbing_lines import undeclared_lines
 from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
+from magfusion.estimation.data_checks.gyro_field_consistency import turned_otherwise
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
 from magfusion.estimation.data_checks.pauses import repeated_samples
 from magfusion.estimation.data_checks.range_step import range_step
@@ -27,7 +28,6 @@ from magfusion.estimation.data_checks.signal import (
 from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.data_checks.truth import truth_findings
-from magfusion.estimation.data_checks.turn_witness import turned_otherwise
 from magfusion.model.aiding import OF_MOTION
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.field_rotation import agrees, axes
 from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.estimation.data_checks.still_means import (
     SPAN,
@@ -19,7 +20,6 @@ from magfusion.estimation.data_checks.still_means import (
     angle_between,
     still_means,
 )
-from magfusion.estimation.data_checks.turning import agrees, axes
 from magfusion.model.platform_motion import A_HAND
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

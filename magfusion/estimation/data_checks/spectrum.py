@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from magfusion.estimation.data_checks.field_rotation import field_body
 from magfusion.estimation.data_checks.resolution import is_scheduled
-from magfusion.estimation.data_checks.turning import field_body
 from magfusion.model.bandpass import is_bandpass
 from magfusion.model.quaternion import rotate
 from magfusion.model.samples import Log

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.data_checks.turning import field_body
+from magfusion.estimation.data_checks.field_rotation import field_body
 from magfusion.model.quaternion import inverse, matrices, rotate
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

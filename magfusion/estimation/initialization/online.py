@@ -22,7 +22,7 @@ from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.among_many import among_all, score_among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.correction import Correction, corrections
-from magfusion.estimation.integrity.diagnosis import diagnosed
+from magfusion.estimation.integrity.fault_isolation import diagnosed
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed_smoothed
 from magfusion.estimation.integrity.released_fault import ReleasedFault

@@ -1,4 +1,4 @@
-"""What may be wrong with one beacon alone: found by leaving each out in turn."""
+"""Faults of one beacon alone: each is left out once."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -33,12 +33,12 @@ from magfusion.model.parameters import (
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array, BoolArray
 
-SUSPECTS = 2  # beacons that are looked at
+MAX_BEACONS = 2  # beacons that are looked at
 WORSE = 6.0  # times its sigmas, that a survey may be wrong
 SURVEYED = 0.3  # of chi square's freedom, that a survey leaves: snapshots weigh by its sigmas too
 MISFIT = 1.2  # chi square of snapshots over its freedom, above which fields are not explained
 SILENT = 0.2  # of the field that is expected
-LOUD = 5.0  # times its noise: a field that is measured, whatever is expected,
+STRONG = 5.0  # times its noise: a field that is measured, whatever is expected,
 LEAKING = 0.01  # unless it is less than this of another's, of which a part leaks into its tone
 STEADY = 0.05  # spread of a gain over time that is none
 WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment, phase (rad)
@@ -53,25 +53,27 @@ def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
         names = [names[k] for k in beacons_of(site, detected).tolist()]
     if len(names) < MIN_DETECTED:
         return
-    left = {name: known.without(name) for name in names}
-    ranked = sorted(names, key=lambda name: left[name].chi_square / max(left[name].freedom, 1.0))
-    for name in ranked[:SUSPECTS]:
+    without = {name: known.without(name) for name in names}
+    ranked = sorted(
+        names, key=lambda name: without[name].chi_square / max(without[name].freedom, 1.0)
+    )
+    for name in ranked[:MAX_BEACONS]:
         # No mistake in a beacon explains more than to leave it out.
-        clear = _explained(known, left[name].chi_square, 0, "phase", "", "").clear
-        if clear and _contradicts(known, left[name], name):
-            for one in _of_one(known, left[name], name):
+        clear = _explained(known, without[name].chi_square, 0, "phase", "", "").clear
+        if clear and _contradicts(known, without[name], name):
+            for one in _of_one(known, without[name], name):
                 yield replace(one, beacon=name)
 
 
-def _contradicts(known: Snapshots, left: Snapshots, name: str) -> bool:
+def _contradicts(known: Snapshots, without: Snapshots, name: str) -> bool:
     """Return whether a beacon contradicts the others, whose survey errs as declared.
 
     Either as another pose and moment of it would, or in any other way.
     """
     kinds = (BEACON_POSITION, BEACON_ROTATION, LOG_MOMENT)
-    free = [(kind, name, wide) for kind, wide in zip(kinds, WIDE[:3], strict=True)]
+    released = [(kind, name, wide) for kind, wide in zip(kinds, WIDE[:3], strict=True)]
     tests = 2 * len(known.site.beacons)
-    return known.rejects_rest(left, tests) or known.rejects(free, tests)
+    return known.rejects_rest(without, tests) or known.rejects(released, tests)
 
 
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
@@ -79,12 +81,12 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
 
     `steady`: usual size of the static field, relative to the Earth's.
     """
-    free = [(MATRIX, MATRIX.owner, 0.3)]
-    if known.excess < MISFIT and not known.rejects(free, tests=1):
+    released = [(MATRIX, MATRIX.owner, 0.3)]
+    if known.excess < MISFIT and not known.rejects(released, tests=1):
         return
-    after, found = known.fitted(free, known.fixes)
+    after, fitted = known.fitted(released, known.fixes)
     magnetometer = known.site.platform.magnetometer
-    change = found.site.platform.magnetometer.matrix - magnetometer.matrix
+    change = fitted.site.platform.magnetometer.matrix - magnetometer.matrix
     even = 0.5 * (change + change.T)
     scale = float(np.trace(even)) / 3.0
     uneven = float(np.max(np.abs(even - scale * np.eye(3))))
@@ -99,7 +101,7 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
         f"the magnetometer's matrix is off by up to {100.0 * float(np.max(np.abs(even))):.2g} %,"
         " as by iron on the body",
         "Calibrate the magnetometer on the body (magfusion calibrate magnetometer).",
-        found.site,
+        fitted.site,
     )
 
 
@@ -107,9 +109,9 @@ def survey_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what a survey that is worse than declared, of all beacons, would explain."""
     if known.excess < MISFIT:
         return
-    free = []
+    released = []
     for beacon in known.site.beacons:
-        free += [
+        released += [
             (
                 BEACON_POSITION,
                 beacon.name,
@@ -122,11 +124,11 @@ def survey_causes(known: Snapshots) -> Iterator[Explanation]:
             ),
             (LOG_MOMENT, beacon.name, WORSE * max(float(np.max(beacon.sigma.log_moment)), 0.005)),
         ]
-    after, found = known.fitted(free, known.fixes)
+    after, fitted = known.fitted(released, known.fixes)
     if after > SURVEYED * known.freedom:
         return  # beacons elsewhere explain a part of anything
     steps = [
-        np.linalg.norm(BEACON_POSITION.difference(known.calibration, found, beacon.name))
+        np.linalg.norm(BEACON_POSITION.difference(known.calibration, fitted, beacon.name))
         for beacon in known.site.beacons
     ]
     yield _explained(
@@ -157,8 +159,8 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
         code, cause = "field_scale", f"the magnetometer's readings are {best:.4g} times the field"
         remedy = "Check its unit (T) and platform.magnetometer.matrix."
     else:
-        sure = [float(np.mean(beacon.sigma.log_moment)) for beacon in known.site.beacons]
-        near = 0.01 + float(np.mean(sure))
+        declared = [float(np.mean(beacon.sigma.log_moment)) for beacon in known.site.beacons]
+        near = 0.01 + float(np.mean(declared))
         words = [w for w, factor in MOMENT_FACTORS.items() if abs(best * factor - 1.0) < near]
         code = "moment_units" if words else "field_scale"
         cause = f"all moments are {best:.4g} times those declared"
@@ -170,31 +172,31 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
             " magnetometer's scale is wrong)"
         )
         remedy = "Give moment_a_m2 as amplitudes in A m^2."
-    undone = _stronger(known.site, best) if code == "moment_units" else None
-    yield _explained(known, after, int(undone is None), code, cause, remedy, undone)
+    corrected = _stronger(known.site, best) if code == "moment_units" else None
+    yield _explained(known, after, int(corrected is None), code, cause, remedy, corrected)
 
 
 def _stronger(site: Site, factor: float) -> Site:
     return replace(site, beacons=tuple(scaled(beacon, factor) for beacon in site.beacons))
 
 
-def _of_one(known: Snapshots, left: Snapshots, name: str) -> Iterator[Explanation]:
-    gain = _gains(known, left.fixes, name)
-    silent = _silent(known, left, name, gain)
+def _of_one(known: Snapshots, without: Snapshots, name: str) -> Iterator[Explanation]:
+    gain = _gains(known, without.fixes, name)
+    silent = _silent(known, without, name, gain)
     if silent is not None:
         yield silent
         return
-    steady = list(_steady_causes(known, left, name))
+    steady = list(_steady_causes(known, without, name))
     yield from steady
-    fault = _fault(known, left, name, gain)
+    fault = _fault(known, without, name, gain)
     # Whatever is wrong with a beacon, to leave it out explains it.
     if not any(one.as_well_as(fault) for one in steady):
         yield fault
 
 
-def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Explanation]:
+def _steady_causes(known: Snapshots, without: Snapshots, name: str) -> Iterator[Explanation]:
     """Yield what is wrong with a beacon all the time."""
-    site, fixes = known.site, left.fixes
+    site, fixes = known.site, without.fixes
     index = [beacon.name for beacon in site.beacons].index(name)
     beacon = site.beacons[index]
 
@@ -217,8 +219,8 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
     yield from rewired
     if any(one.clear for one in rewired):
         return  # to turn the beacon over, or its phase, says the same in other words
-    after, found = known.fitted([(LOG_MOMENT, name, WIDE[2])], fixes)
-    factors = np.exp(LOG_MOMENT.difference(known.calibration, found, name))
+    after, fitted = known.fitted([(LOG_MOMENT, name, WIDE[2])], fixes)
+    factors = np.exp(LOG_MOMENT.difference(known.calibration, fitted, name))
     moments = _explained(
         known,
         after,
@@ -226,14 +228,14 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
         "moments",
         f"the moments of beacon {name} are {_listed(factors, 3)} times those declared",
         f"Measure the current of beacon {name}, or calibrate it (magfusion calibrate beacon).",
-        found.site,
+        fitted.site,
     )
     yield moments
     if not moments.clear:
         yield from coil_phase(known, beacon, trial)
     if beacon.synchronised:
-        after, found = known.fitted([(PHASE, name, WIDE[3])], fixes)
-        lag = PHASE.difference(known.calibration, found, name) / DEGREE
+        after, fitted = known.fitted([(PHASE, name, WIDE[3])], fixes)
+        lag = PHASE.difference(known.calibration, fitted, name) / DEGREE
         yield _explained(
             known,
             after,
@@ -249,12 +251,12 @@ def _moved(
     known: Snapshots, fixes: Fixes, beacon: Beacon, trial: Callable[[Beacon], Snapshots]
 ) -> Explanation:
     name = beacon.name
-    free = [(BEACON_POSITION, name, WIDE[0]), (BEACON_ROTATION, name, WIDE[1])]
+    released = [(BEACON_POSITION, name, WIDE[0]), (BEACON_ROTATION, name, WIDE[1])]
     best, at = np.inf, known.calibration
     for place in _placed(beacon):
-        after, found = trial(place).fitted(free, fixes)
+        after, fitted = trial(place).fitted(released, fixes)
         if after < best:
-            best, at = after, found
+            best, at = after, fitted
         if best < known.freedom:
             break
     step = BEACON_POSITION.difference(known.calibration, at, name)
@@ -271,17 +273,17 @@ def _moved(
     )
 
 
-def _silent(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explanation | None:
+def _silent(known: Snapshots, without: Snapshots, name: str, gain: Array) -> Explanation | None:
     """Return that a beacon is silent, where it is."""
-    heard = np.isfinite(gain)
-    silent = heard & (np.abs(gain) < SILENT) & ~_is_loud(known, name)
-    if np.sum(silent) < max(2, 0.05 * np.sum(heard)):
+    detected = np.isfinite(gain)
+    silent = detected & (np.abs(gain) < SILENT) & ~_is_strong(known, name)
+    if np.sum(silent) < max(2, 0.05 * np.sum(detected)):
         return None
-    whole = np.sum(silent) > 0.9 * np.sum(heard)
+    whole = np.sum(silent) > 0.9 * np.sum(detected)
     when = "" if whole else f" {_when(known.samples.time, silent)}"
     return _explained(
         known,
-        left.chi_square,
+        without.chi_square,
         0,
         "silent_beacon",
         f"beacon {name} is silent{when}",
@@ -289,27 +291,29 @@ def _silent(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explan
     )
 
 
-def _fault(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explanation:
+def _fault(known: Snapshots, without: Snapshots, name: str, gain: Array) -> Explanation:
     """Return that a beacon is false, in a part of the log or in some way."""
     usual = np.nanmedian(gain.real) + 1j * np.nanmedian(gain.imag)
     false = np.isfinite(gain) & (np.abs(gain - usual) > STEADY)
     worst = 100.0 * float(np.nanmax(np.abs(gain - 1.0)))
     size = f"by up to {worst:.2g} %" if worst < 1e3 else "altogether"
     cause = f"the field of beacon {name} is false {size}"
-    passes = abs(usual - 1.0) < STEADY and 2 <= np.sum(false) < 0.8 * np.sum(np.isfinite(gain))
-    if passes:
+    is_transient = abs(usual - 1.0) < STEADY and 2 <= np.sum(false) < 0.8 * np.sum(
+        np.isfinite(gain)
+    )
+    if is_transient:
         cause += f" {_when(known.samples.time, false)}"
     else:
         cause += ": it fits no pose and no moment of the beacon"
     fault = _explained(
         known,
-        left.chi_square * known.freedom / max(left.freedom, 1.0),
+        without.chi_square * known.freedom / max(without.freedom, 1.0),
         3,
         "beacon_fault",
         cause,
         "Check its supply and what is near it; leave it out.",
     )
-    return replace(fault, catch_all=not passes)
+    return replace(fault, catch_all=not is_transient)
 
 
 def _when(time: Array, chosen: BoolArray) -> str:
@@ -327,14 +331,14 @@ def _gains(known: Snapshots, fixes: Fixes, name: str) -> Array:
     return np.sum(np.conj(expected) * measured, axis=(1, 2)) / power
 
 
-def _is_loud(known: Snapshots, name: str) -> BoolArray:
+def _is_strong(known: Snapshots, name: str) -> BoolArray:
     """Return at which epochs a beacon's field is measured, shape (n,)."""
     samples = known.samples
     own = np.array([beacon == name for beacon, _ in samples.channels])
     power = np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=2)
     noise = 2.0 * np.trace(samples.phasor_cov, axis1=2, axis2=3)
     field, others = np.sum(power[:, own], axis=1), np.max(power[:, ~own], axis=1, initial=0.0)
-    is_field = field > LOUD**2 * np.nansum(noise[:, own], axis=1)
+    is_field = field > STRONG**2 * np.nansum(noise[:, own], axis=1)
     return np.asarray(is_field & (field > LEAKING**2 * others))
 
 
@@ -377,14 +381,14 @@ def _placed(beacon: Beacon) -> Iterator[Beacon]:
 def _explained(
     known: Snapshots,
     after: float,
-    found: int,
+    count: int,
     code: str,
     cause: str,
     remedy: str,
     site: Site | None = None,
 ) -> Explanation:
     return Explanation(
-        code, cause, remedy, known.chi_square, after, known.freedom, found, site=site
+        code, cause, remedy, known.chi_square, after, known.freedom, count, site=site
     )
 
 

@@ -13,6 +13,11 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import holm, sigmas
+from magfusion.estimation.integrity.fault_candidates import (
+    FaultCandidate,
+    display_name,
+    fault_candidates,
+)
 from magfusion.estimation.integrity.fixed_parameter_test import (
     LEAST_EVIDENCE,
     MAX_LINEAR_CHI_SQUARE,
@@ -24,7 +29,6 @@ from magfusion.estimation.integrity.released_fault import (
     release_gain,
 )
 from magfusion.estimation.integrity.score import Score, answered, scores_of
-from magfusion.estimation.integrity.suspects import Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
     BEACON_POSITION,
@@ -189,7 +193,7 @@ def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestR
     information, gradient = score.with_declared(tolerance=True)
     own, size = list(score.fixed[-len(steps) :]), dimension(score.fixed)
     rows = np.concatenate([np.arange(size)[block.columns] for block in own[1:]])
-    pose = Suspect(changed_name(own[1:]), tuple(own[1:]), np.eye(size)[:, rows], CHANGED)
+    pose = FaultCandidate(changed_name(own[1:]), tuple(own[1:]), np.eye(size)[:, rows], CHANGED)
     released = (
         release_fault(pose_cov, score, fault, information, gradient)
         for fault in (*_fault_candidates(own, size), pose)
@@ -204,7 +208,7 @@ def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestR
     return TestResult((known,), gain=cause.gain)
 
 
-def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Suspect]:
+def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[FaultCandidate]:
     """Return the possible changes at each of some times, as columns after the fixed ones."""
     return [
         fault
@@ -225,7 +229,9 @@ def explained_throughout(result: Smoothed, log: Log, rival: float) -> bool:
 
 def _throughout(site: Site, score: Score, information: Array, gradient: Array) -> float:
     """Return the largest gain of a fixed parameter that is wrong throughout."""
-    every = (release_gain(one, information, gradient) for one in suspects(site, score.fixed))
+    every = (
+        release_gain(one, information, gradient) for one in fault_candidates(site, score.fixed)
+    )
     return max((one.gain for one in every if one is not None), default=0.0)
 
 
@@ -258,17 +264,17 @@ def _again(every: tuple[Block, ...], parts: list[list[Block]]) -> Iterator[list[
         yield [at[block.key] for block in part]
 
 
-def _fault_candidates(blocks: list[Block], size: int) -> Iterator[Suspect]:
+def _fault_candidates(blocks: list[Block], size: int) -> Iterator[FaultCandidate]:
     """Yield the effects of single events: on a beacon, or on the reception of all."""
     gains = [block for block in blocks if _of(block) == GAIN]
     if len(gains) > 1:
         common = np.zeros((size, 1))
         for block in gains:
             common[block.columns] = 1.0
-        yield Suspect("the strength of all fields", tuple(gains), common, CHANGED)
+        yield FaultCandidate("the strength of all fields", tuple(gains), common, CHANGED)
     for block in blocks:
         combine = np.eye(size)[:, np.arange(size)[block.columns]]
-        yield Suspect(changed_name((block,)), (block,), combine, CHANGED)
+        yield FaultCandidate(changed_name((block,)), (block,), combine, CHANGED)
 
 
 def _of(block: Block) -> Parameter:
@@ -298,7 +304,7 @@ def changed_name(blocks: Sequence[Block]) -> str:
     }
     if kind in words:
         return words[kind]
-    return spoken_name(block._replace(parameter=kind))
+    return display_name(block._replace(parameter=kind))
 
 
 def change_finding(cause: ReleasedFault, sigma: Array) -> Finding:

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.released_fault import ReleasedFault
-from magfusion.estimation.integrity.suspects import (
+from magfusion.estimation.integrity.fault_candidates import (
     SAMPLE_RATE,
     STRETCH,
     TILT,
     TYPICAL_TILT,
-    Suspect,
+    FaultCandidate,
 )
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.model.field import skew
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import (
@@ -102,7 +102,7 @@ _OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
 }
 
 
-def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
+def corrected_site(site: Site, fault: FaultCandidate, step: Array) -> Site:
     """Return a site with the parameters of a candidate fault moved.
 
     `step` (h,): of all fixed parameters, in typical errors.
@@ -150,7 +150,7 @@ def corrected_by(site: Site, cause: ReleasedFault) -> Site:
     return replace(result, beacons=tuple(widened(beacon) for beacon in result.beacons))
 
 
-def released_blocks(fault: Suspect) -> tuple[Block, ...]:
+def released_blocks(fault: FaultCandidate) -> tuple[Block, ...]:
     """Return the blocks of a candidate fault if a site can declare their sigmas.
 
     They are of one owner, or of beacons.

@@ -17,17 +17,22 @@ from magfusion.estimation.integrity.corrected_site import (
     wide_sigmas,
     with_sigmas,
 )
-from magfusion.estimation.integrity.diagnosis import CAUSE_FIRST, Diagnosis
+from magfusion.estimation.integrity.fault_candidates import (
+    LEVER_ARM,
+    TYPICAL,
+    FaultCandidate,
+    fault_candidates,
+)
+from magfusion.estimation.integrity.fault_isolation import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.fixed_parameter_test import (
     LEAST_EVIDENCE,
     amounts,
     error_in_words,
     finding_of,
 )
-from magfusion.estimation.integrity.likely_cause import QUANTISED
+from magfusion.estimation.integrity.hypothesis_tests import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import LEVER_ARM, TYPICAL, Suspect, suspects
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import SENSOR_POSITION, Block, Calibration, initial_calibration
@@ -62,7 +67,9 @@ class Correction(NamedTuple):
 
     finding: Finding  # what is wrong
     site: Site  # in which it is undone
-    fault: Suspect | None = None  # the candidate fault, if it is an incorrect fixed parameter
+    fault: FaultCandidate | None = (
+        None  # the candidate fault, if it is an incorrect fixed parameter
+    )
     rivals: tuple[Rival, ...] = ()
     step_spread: Array | None = None  # (states or 1, 6, 6), by the uncertainty of the step
     clear: bool = False  # whether snapshots of the fields alone are sure of it
@@ -138,7 +145,7 @@ def _by_score(
     return known._replace(rivals=(*others, *_other_frame(site, known.site, 0.5)))
 
 
-def _along(fault: Suspect, step: Array) -> Array:
+def _along(fault: FaultCandidate, step: Array) -> Array:
     """Return a step along the directions of a candidate fault."""
     return np.asarray(np.linalg.lstsq(fault.combine, step, rcond=None)[0])
 
@@ -320,7 +327,7 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
     is_open = correction.is_estimate and not correction.released
     if score is None or not (correction.fault or is_open):
         return None
-    every = suspects(correction.site, score.fixed)
+    every = fault_candidates(correction.site, score.fixed)
     if correction.fault is not None:
         own = [one for one in every if one.name == correction.fault.name]
     else:
@@ -342,7 +349,10 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
 
 
 def open_rivals(
-    correction: Correction, candidates: Sequence[Suspect], information: Array, gradient: Array
+    correction: Correction,
+    candidates: Sequence[FaultCandidate],
+    information: Array,
+    gradient: Array,
 ) -> list[Rival]:
     """Return the rivals of a correction that the corrected data do not refute.
 
@@ -373,7 +383,7 @@ def spread_with_rivals(correction: Correction, score: Score | None) -> Array:
     """Return the covariance as `spread_of`, and by what explains the log as well."""
     spread, rivals = spread_of(correction, score), list(correction.rivals)
     if score is not None:
-        candidates = list(suspects(correction.site, score.fixed))
+        candidates = list(fault_candidates(correction.site, score.fixed))
         rivals = open_rivals(correction, candidates, *score.with_declared(tolerance=False))
     for rival in rivals:
         spread = spread + _of_states(rival.spread, 1 if score is None else len(score.by_pose))

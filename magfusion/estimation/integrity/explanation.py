@@ -10,13 +10,13 @@ from magfusion.model.site import Site
 
 LEAST_FALL = 60.0  # of chi square, that an explanation must bring
 CLEARLY = 2.5  # times smaller than before must chi square be, and than with any other cause
-SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
-PENALTY = 6.0  # of chi square, for each parameter that is found
-ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
+SIGNIFICANT = 60.0  # fall for each estimated parameter, in units of the remaining mean square
+PENALTY = 6.0  # of chi square, for each estimated parameter
+ENOUGH = 1.5  # times the degrees of freedom: the rest where all is explained
 # Survey errors may leave more than noise: this share of chi square before, but not more than errors
 # twice as large as declared (in chi square, times expected), or this share of a gross mistake's.
 LITTLE, MOST_LEFT, VERY_LITTLE = 0.04, 4.0, 0.004
-ALIKE = 1.5  # times the chi square of another, that explains as well
+SIMILAR = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
 
@@ -26,26 +26,26 @@ class Explanation:
     """One thing that people get wrong, tried on a log."""
 
     code: str  # of `magfusion.model.trust.CODES`
-    # cause, remedy: a clause that says what is wrong, and what to do
+    # cause, remedy: clauses: what is wrong, and what to do
     cause: str
     remedy: str
     # before, after: chi square as declared, and with this explanation
     before: float
     after: float
     expected: float  # degrees of freedom
-    found: int = 0  # parameters that were found to explain it
+    parameter_count: int = 0  # that were estimated for it
     beacon: str = ""  # the one beacon in which the mistake is; empty of any other mistake
-    # whether it says what contradicts the rest, and not why: so it explains whatever is wrong
-    # there, and is no rival of what does say why
+    # whether it localises a fault without a reason: so it explains whatever is wrong
+    # there, and is no rival of one with a reason
     catch_all: bool = False
-    site: Site | None = None  # in which the mistake is undone, where it can be
-    # another site that explains the motion alike, of the same code: tried where this one fails
+    site: Site | None = None  # in which the mistake is corrected, where it can be
+    # another site that explains the motion as well, of the same code: tried where this one fails
     rival: "Explanation | None" = None
 
     @property
     def score(self) -> float:
-        """Chi square, with a price for what had to be found."""
-        return self.after + PENALTY * self.found
+        """Chi square, with a price for each estimated parameter."""
+        return self.after + PENALTY * self.parameter_count
 
     @property
     def fall(self) -> float:
@@ -59,28 +59,30 @@ class Explanation:
 
     @property
     def clear(self) -> bool:
-        """Whether it explains so much that it is worth saying."""
+        """Whether it explains enough to be reported."""
         by_survey = min(LITTLE * self.before, MOST_LEFT * self.expected)
         by_noise, of_gross = ENOUGH * self.expected, VERY_LITTLE * self.before
         enough = self.after < max(by_noise, by_survey, of_gross)
-        # A bias or a lever arm that its prior holds back costs little, however sure it is.
+        # A bias or a lever arm that its prior holds back costs little, however certain it is.
         noise = max(self.after / max(self.expected, 1.0), 1e-9)
-        significant = self.found > 0 and self.fall / self.found > SIGNIFICANT * noise
+        significant = (
+            self.parameter_count > 0 and self.fall / self.parameter_count > SIGNIFICANT * noise
+        )
         clearly = self.before > CLEARLY * self.after or significant
         return enough and self.fall > LEAST_FALL and clearly
 
     def as_well_as(self, other: "Explanation") -> bool:
         """Return whether it leaves hardly more than another, or no more than is expected."""
-        return self.after < max(ALIKE * other.after + LEAST_FALL / 2.0, self.expected)
+        return self.after < max(SIMILAR * other.after + LEAST_FALL / 2.0, self.expected)
 
-    def rivalled_by(self, other: "Explanation") -> bool:
+    def is_ambiguous_with(self, other: "Explanation") -> bool:
         """Return whether another would be another answer."""
         if other.catch_all and not self.catch_all:
             return self.beacon not in ("", other.beacon)
         return other.code != self.code
 
     def text(self, of: str) -> str:
-        """Return the sentences that say it, with the evidence."""
+        """Return the sentences that state it, with the evidence."""
         cause = self.cause[:1].upper() + self.cause[1:]
         return (
             f"{cause}. With that, the chi square of {of} falls from {self.before:.4g} to"
@@ -92,7 +94,7 @@ def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
     """Return the explanation that is better than those of any other code, if there is one.
 
     What leaves out all that is wrong has the smallest chi square there can be: a mistake that
-    explains as much, and says what it is, is the better explanation.  Of one code, the first of
+    explains as much, and names the reason, is the better explanation.  Of one code, the first of
     those that explain equally much is the most common.
     """
     every = [one for one in tried if isfinite(one.score)]  # without one if it has no solution
@@ -109,7 +111,7 @@ def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
         best = next(named, best)
     if not best.clear:
         return None
-    rival = next((one for one in ranked if best.rivalled_by(one)), None)
+    rival = next((one for one in ranked if best.is_ambiguous_with(one)), None)
     if rival is None or rival.score - best.score > max(MARGIN, 0.2 * best.score):
         return best
     return None

@@ -49,7 +49,7 @@ LENGTH_FACTORS = {
 
 
 class Way(NamedTuple):
-    """A site in which a mistake is undone."""
+    """A site in which a mistake is corrected."""
 
     code: str
     cause: str
@@ -272,7 +272,7 @@ def _exchanges(site: Site) -> Iterator[Way]:
 
 
 def _differ_in_moments(beacons: Sequence[Beacon]) -> bool:
-    """Return whether coils of beacons have other moments, at tones that differ alike."""
+    """Return whether coils of beacons have other moments, at tones that differ in the same way."""
     kinds = {tuple((coil.frequency_hz, coil.slot) for coil in one.coils) for one in beacons}
     first, *others = beacons
     return len(kinds) == 1 and any(
@@ -323,8 +323,8 @@ def coils_exchanged(beacon: Beacon) -> Beacon:
 def _angles(beacon: Beacon, factor: float) -> Beacon:
     """Return a beacon whose roll, pitch and yaw are multiplied."""
     angles = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz")
-    turned = Rotation.from_euler("xyz", factor * angles).as_matrix()
-    return replace(beacon, world_from_beacon=turned)
+    rotated = Rotation.from_euler("xyz", factor * angles).as_matrix()
+    return replace(beacon, world_from_beacon=rotated)
 
 
 def _sign_changed(beacon: Beacon, axis: int) -> Beacon:

@@ -12,18 +12,18 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import sigmas
-from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
-from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
-from magfusion.estimation.integrity.suspects import (
+from magfusion.estimation.integrity.fault_candidates import (
     EPOCH_SHIFT,
     SAMPLE_RATE,
     STRETCH,
     TILT,
     TYPICAL_SHIFT,
     TYPICAL_TILT,
-    Suspect,
-    suspects,
+    FaultCandidate,
+    fault_candidates,
 )
+from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
+from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, Parameter, prior_sigma
 from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
@@ -50,7 +50,7 @@ def check_fixed_parameters(case: Case, *, without_effect: bool = False) -> TestR
         return NOTHING
     score, site = case.score, case.result.declared.site
     unverified = tuple(_unverified(case, score))
-    candidates = list(suspects(site, score.fixed))
+    candidates = list(fault_candidates(site, score.fixed))
     causes = list(
         causes_of(
             case.pose_cov,
@@ -88,7 +88,7 @@ class NamedCause(NamedTuple):
 def causes_of(
     pose_cov: Array,
     score: Score,
-    candidates: Callable[[Array, Array], Sequence[Suspect]],
+    candidates: Callable[[Array, Array], Sequence[FaultCandidate]],
     is_cause: Callable[[ReleasedFault, Array], bool] = lambda *_: True,
     *,
     without_effect: bool = False,

@@ -1,4 +1,4 @@
-"""What people get wrong of the inertial sensor and of how the magnetometer is mounted beside it."""
+"""What people get wrong of the inertial sensor and of how the magnetometer is mounted on it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,8 +15,8 @@ from magfusion.estimation.integrity.corrected_site import (
     with_magnetometer,
 )
 from magfusion.estimation.integrity.explanation import Explanation
+from magfusion.estimation.integrity.fault_candidates import LARGEST
 from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
-from magfusion.estimation.integrity.suspects import LARGEST
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
 from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
@@ -37,9 +37,9 @@ ACCEL_UNITS = {
     "in cm/s^2": 1e-2,
     "in mm/s^2": 1e-3,
 }
-LATEST = 3.0  # s
+MAX_DELAY = 3.0  # s
 PARTS = 4  # of a log, in each of which a delay is sought
-UNUSUAL = 3.0  # sigmas of a declared time offset
+DOUBT_SIGMAS = 3.0  # sigmas of a declared time offset
 EYE = np.eye(3)
 OF_AXES = "Check the order and the signs of the IMU's axes, and body_from_sensor."
 
@@ -58,10 +58,10 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
     ) -> Explanation:
         after, _ = known.explained(gyro_axes, accel_axes, gravity=gravity)
         inverse = [np.asarray(np.linalg.inv(axes), dtype=float) for axes in (gyro_axes, accel_axes)]
-        undone = with_intrinsics(site, *inverse) if gravity else with_gravity(site, 0.0)
-        return Explanation(code, cause, remedy, before, after, known.freedom, site=undone)
+        corrected = with_intrinsics(site, *inverse) if gravity else with_gravity(site, 0.0)
+        return Explanation(code, cause, remedy, before, after, known.freedom, site=corrected)
 
-    yield from _turned(known, before, site)
+    yield from _rotated_axes(known, before, site)
     yield from _axes(tried)
     imu = "Check gyro_x/y/z and accel_x/y/z: right-handed axes, rad/s, m/s^2, +g on z at rest."
     for words, unit in ACCEL_UNITS.items():
@@ -80,13 +80,13 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
     yield _upside_down(known, before, site)
     yield _scaled(known, before, site)
     yield from _accel_scaled(known, before, site)
-    yield from _freed(known, before, site)
+    yield from _released(known, before, site)
 
 
-def _turned(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
+def _rotated_axes(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     """Yield what quarter turns of the magnetometer in its mounting, or of the IMU, would explain.
 
-    Both rotate alike; but the lever arm, declared in the IMU's axes, turns with the IMU alone.
+    Both rotate together; but the lever arm, declared in the IMU's axes, turns with the IMU alone.
     """
     lever = site.platform.magnetometer.position_body
     for axes in _signed_permutations():
@@ -104,7 +104,7 @@ def _turned(known: Compared, before: float, site: Site) -> Iterator[Explanation]
             known.freedom,
             site=with_magnetometer(site, body_from_sensor=right),
         )
-        turned = Explanation(
+        rotated = Explanation(
             "mounting",
             f"the IMU's axes are turned against those that the mounting declares, {by}: x, y, z"
             f" are {_named(axes)}",
@@ -114,14 +114,14 @@ def _turned(known: Compared, before: float, site: Site) -> Iterator[Explanation]
             known.freedom,
             site=with_intrinsics(site, axes.T, axes.T),
         )
-        yield replace(mounted, rival=turned)
-        yield replace(turned, rival=mounted)
+        yield replace(mounted, rival=rotated)
+        yield replace(rotated, rival=mounted)
 
 
-def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
+def _released(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     """Yield what a lever arm, a mounting or a bias beyond its prior would explain."""
-    after, found = known.explained(EYE, EYE, parameters="lever")
-    lever = site.platform.magnetometer.position_body - found[SHARED["lever"]]
+    after, estimate = known.explained(EYE, EYE, parameters="lever")
+    lever = site.platform.magnetometer.position_body - estimate[SHARED["lever"]]
     yield Explanation(
         "lever_arm",
         f"the lever arm is ({_listed(lever)}) m",
@@ -135,8 +135,8 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     )
     turn, axes = Rotation.identity(), EYE
     for _ in range(4):
-        after, found = known.explained(axes, axes, parameters="mounting")
-        turn = Rotation.from_rotvec(found[SHARED["mounting"]]) * turn
+        after, estimate = known.explained(axes, axes, parameters="mounting")
+        turn = Rotation.from_rotvec(estimate[SHARED["mounting"]]) * turn
         axes = turn.as_matrix()
     yield Explanation(
         "mounting",
@@ -152,13 +152,13 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         ),
     )
     for sensor, unit, bias in (("gyro", "rad/s", GYRO_BIAS), ("accel", "m/s^2", ACCEL_BIAS)):
-        after, found = known.explained(EYE, EYE, parameters=sensor)
-        if np.max(np.abs(found[SHARED[sensor]])) > LARGEST[bias]:
+        after, estimate = known.explained(EYE, EYE, parameters=sensor)
+        if np.max(np.abs(estimate[SHARED[sensor]])) > LARGEST[bias]:
             continue
         yield Explanation(
             "imu_bias",
             f"the bias of the {'gyro' if sensor == 'gyro' else 'accelerometer'} is"
-            f" ({_listed(found[SHARED[sensor]])}) {unit}, beyond its declared sigma",
+            f" ({_listed(estimate[SHARED[sensor]])}) {unit}, beyond its declared sigma",
             f"Calibrate it, or declare a larger {sensor}_bias_sigma.",
             before,
             after,
@@ -296,10 +296,10 @@ def timing_causes(
     fixes = known.fixes
     edges = np.linspace(0, len(fixes), PARTS + 1).astype(np.int64).tolist()
     late = [_delay(fixes, imu, site, slice(*part)) for part in pairwise(edges)]
-    told = [(at, value) for at, value in late if np.isfinite(value)]
-    if len(told) < 2:
+    measured = [(at, value) for at, value in late if np.isfinite(value)]
+    if len(measured) < 2:
         return
-    at, value = np.array(told).T
+    at, value = np.array(measured).T
     middle = float(np.median(value))
     steady = compared(known, imu, site, late=middle)
     offset = np.inf
@@ -307,7 +307,7 @@ def timing_causes(
         after, _ = steady.explained(EYE, EYE)
         offset = after
     # What every estimator finds, as its sigma says that it may be, is no mistake.
-    if steady is not None and abs(middle) > UNUSUAL * site.platform.imu.time_offset_sigma:
+    if steady is not None and abs(middle) > DOUBT_SIGMAS * site.platform.imu.time_offset_sigma:
         yield Explanation(
             "time_offset",
             f"the inertial stamps are {middle:.3g} s late against the magnetometer's",
@@ -318,7 +318,7 @@ def timing_causes(
             1,
             site=with_imu(site, time_offset=site.platform.imu.time_offset - middle),
         )
-    if len(told) < 3:
+    if len(measured) < 3:
         return
     rate, start = np.polyfit(at, value, 1)
     if abs(rate) < 1e-4:
@@ -351,7 +351,7 @@ def _delay(fixes: Fixes, imu: ImuSamples, site: Site, part: slice) -> tuple[floa
     total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps))])
     turn = fixes.world_from_body[part, 0]
     angle = Rotation.from_matrix(np.swapaxes(turn[:-1], 1, 2) @ turn[1:]).magnitude()
-    trial = np.arange(-LATEST, LATEST, 0.01)
+    trial = np.arange(-MAX_DELAY, MAX_DELAY, 0.01)
     edges = np.interp(time[:, None] + trial, stamps, total)
     seen = np.diff(edges, axis=0)
     cost = np.sum((seen - angle[:, None]) ** 2, axis=0)
@@ -359,6 +359,6 @@ def _delay(fixes: Fixes, imu: ImuSamples, site: Site, part: slice) -> tuple[floa
     usual = float(np.median(cost))
     if not 0 < best < len(trial) - 1 or cost[best] > 0.5 * usual:
         return float(np.mean(time)), np.nan
-    left, at, right = cost[best - 1 : best + 2]
-    fine = 0.5 * (left - right) / (left - 2.0 * at + right)
+    before_it, at, right = cost[best - 1 : best + 2]
+    fine = 0.5 * (before_it - right) / (before_it - 2.0 * at + right)
     return float(np.mean(time)), float(trial[best] + 0.01 * fine)

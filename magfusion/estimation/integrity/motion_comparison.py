@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from magfusion.estimation.data_checks.turning import convolved
+from magfusion.estimation.data_checks.field_rotation import convolved
 from magfusion.estimation.integrity.field_snapshots import OF_SURVEY
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs

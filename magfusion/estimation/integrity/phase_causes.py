@@ -1,4 +1,4 @@
-"""What may be wrong with clocks and drive phases: each epoch's phases are found beside its pose."""
+"""Faults of clocks and drive phases: each epoch's phases are estimated with its pose."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -24,9 +24,9 @@ RATE_REACH = 0.02  # relative; clocks that are farther off are not sought
 COMMON = 0.2  # spread of relative rates, of their mean, that is one clock's
 STILL = 2e-6  # relative rate that is none
 REVERSED = 0.1  # rad, that a phase may be off a half turn
-ALIKE = 0.7  # of the chi square of constant phases, that those of other clocks may leave
+SIMILAR = 0.7  # of the chi square of constant phases, that those of other clocks may leave
 LARGEST_ADVANCE = 60.0 * DEGREE  # rad; beyond, a coil is reversed or in the wrong quadrature
-DENSE = 60  # neighbouring epochs that tell a rate
+DENSE = 60  # neighbouring epochs that determine a rate
 
 
 def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]:
@@ -44,16 +44,16 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     rate = _rates(known, every, tones_hz)
     phase = loose.phase[:, 0]
     mean = np.angle(np.nansum(np.exp(1j * phase), axis=0))
-    constant = _turned(known, mean)
+    constant = _rotated(known, mean)
     if rate is not None and np.max(np.abs(rate)) > STILL:
         clocks = list(_of_clocks(known, phase, rate, tones_hz))
-        if all(one.after < ALIKE * constant.chi_square - LEAST_FALL for one in clocks):
+        if all(one.after < SIMILAR * constant.chi_square - LEAST_FALL for one in clocks):
             yield from clocks
             return
     shift = _shift(mean, tones_hz)
-    shifted = _turned(known, -TWO_PI * tones_hz * shift)
+    shifted = _rotated(known, -TWO_PI * tones_hz * shift)
     side = "late" if shift > 0.0 else "early"
-    yield _said(
+    yield _explanation(
         known,
         shifted,
         1,
@@ -64,9 +64,11 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
         " the delay of the magnetometer's stamps.",
     )
     if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
-        yield _said(known, _turned(known, np.full(len(mean), np.pi)), 0, *left_handed())
-    elif not _wired(known, mean) and constant.chi_square < ALIKE * shifted.chi_square - LEAST_FALL:
-        yield _said(
+        yield _explanation(known, _rotated(known, np.full(len(mean), np.pi)), 0, *left_handed())
+    elif (
+        not _wired(known, mean) and constant.chi_square < SIMILAR * shifted.chi_square - LEAST_FALL
+    ):
+        yield _explanation(
             known,
             constant,
             len(mean),
@@ -78,21 +80,21 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
 
 
 def _wired(known: Snapshots, phase: Array) -> bool:
-    """Tell whether phases are those of one beacon's wires, which are tried for themselves."""
+    """Return whether phases are those of one beacon's wires, which are tried for themselves."""
     over = np.abs(np.abs(phase) - np.pi) < REVERSED
     names = {known.samples.channels[k][0] for k in np.flatnonzero(over).tolist()}
     return len(names) == 1 and bool(np.all(over | (np.abs(phase) < REVERSED)))
 
 
-def _said(
-    known: Snapshots, tried: Snapshots, found: int, code: str, cause: str, remedy: str
+def _explanation(
+    known: Snapshots, tried: Snapshots, count: int, code: str, cause: str, remedy: str
 ) -> Explanation:
     return Explanation(
-        code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, found
+        code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, count
     )
 
 
-def _turned(known: Snapshots, turn: Array) -> Snapshots:
+def _rotated(known: Snapshots, turn: Array) -> Snapshots:
     """Return epochs whose phasors have gone ahead by so much as is taken off here (rad)."""
     phasor = known.samples.phasor_sensor * np.exp(-1j * turn)[..., None]
     return replace(known, samples=replace(known.samples, phasor_sensor=phasor))
@@ -111,16 +113,16 @@ def _rates(known: Snapshots, every: FieldSamples, tones_hz: Array) -> Array | No
     trial = np.arange(-RATE_REACH, RATE_REACH, 0.25 / (elapsed[-1] * np.max(tones_hz)))
     out = []
     for k, tone in enumerate(tones_hz):
-        turned = np.exp(1j * (phase[:, k] - TWO_PI * tone * trial[:, None] * elapsed))
-        best = float(trial[np.argmax(np.abs(np.sum(turned, axis=1)))])
-        left = np.angle(
+        rotated = np.exp(1j * (phase[:, k] - TWO_PI * tone * trial[:, None] * elapsed))
+        best = float(trial[np.argmax(np.abs(np.sum(rotated, axis=1)))])
+        remaining = np.angle(
             np.exp(1j * phase[:, k])
             * np.exp(-1j * TWO_PI * tone * best * elapsed)
             * np.exp(
                 -1j * np.angle(np.sum(np.exp(1j * (phase[:, k] - TWO_PI * tone * best * elapsed))))
             )
         )
-        out.append(best + float(np.polyfit(elapsed, left, 1)[0]) / (TWO_PI * tone))
+        out.append(best + float(np.polyfit(elapsed, remaining, 1)[0]) / (TWO_PI * tone))
     return np.array(out)
 
 
@@ -128,43 +130,43 @@ def _of_clocks(
     known: Snapshots, phase: Array, rate: Array, tones_hz: Array
 ) -> Iterator[Explanation]:
     time, common = known.samples.time, float(np.median(rate))
-    alike = np.abs(rate - common) < max(COMMON * abs(common), STILL)
-    turn, found = TWO_PI * tones_hz * rate * time[:, None], len(rate)
-    left = np.angle(np.nansum(np.exp(1j * (phase - turn)), axis=0))
-    tried = _turned(known, turn + left)
+    is_common = np.abs(rate - common) < max(COMMON * abs(common), STILL)
+    turn, count = TWO_PI * tones_hz * rate * time[:, None], len(rate)
+    remaining = np.angle(np.nansum(np.exp(1j * (phase - turn)), axis=0))
+    tried = _rotated(known, turn + remaining)
     names = [name for name, _ in known.samples.channels]
     usual = max(float(np.median(np.abs(rate))), STILL)
     strays = [n for n, r in zip(names, rate, strict=True) if abs(r) > 10.0 * usual]
     beacon, site = "", None
-    if np.all(alike):
-        code, found = "sample_rate", 2
+    if np.all(is_common):
+        code, count = "sample_rate", 2
         slower = (1.0 + known.site.platform.magnetometer.clock_rate) * (1.0 + common) - 1.0
         if not known.site.platform.further:
             site = with_magnetometer(known.site, clock_rate=slower)
         cause = f"the magnetometer's stamps run {1e6 * -common:.4g} ppm fast against the drives"
         remedy = "Check the sample rate with which the stamps were made."
     elif len(set(strays)) == 1:
-        code, found = "beacon_clock", 2
+        code, count = "beacon_clock", 2
         beacon, k = strays[0], names.index(strays[0])
         cause = f"beacon {strays[0]} runs at {tones_hz[k] * (1.0 + rate[k]):.6g} Hz"
         remedy = "Correct its frequency_hz, or declare synchronised: false."
     else:
-        code, found = "beacon_clock", 2 * len(rate)
+        code, count = "beacon_clock", 2 * len(rate)
         cause = "the drives run on clocks of their own"
         remedy = "Declare synchronised: false for the beacons."
     explained = known.chi_square, tried.chi_square, known.freedom
-    yield Explanation(code, cause, remedy, *explained, found, beacon, site=site)
+    yield Explanation(code, cause, remedy, *explained, count, beacon, site=site)
 
 
 def _shift(phase: Array, tones_hz: Array) -> float:
-    """Return the delay (s) that phases show, the shortest of those that explain them alike."""
+    """Return the delay (s) that phases show, the shortest of those that explain them equally."""
     trial = np.arange(-LONGEST_SHIFT, LONGEST_SHIFT, SHIFT_STEP)
-    turned = np.exp(1j * (phase + TWO_PI * tones_hz * trial[:, None]))
-    agreement = np.real(np.sum(turned, axis=1))
+    rotated = np.exp(1j * (phase + TWO_PI * tones_hz * trial[:, None]))
+    agreement = np.real(np.sum(rotated, axis=1))
     near = np.flatnonzero(agreement > np.max(agreement) - 0.02)
     best = float(trial[near[np.argmin(np.abs(trial[near]))]])
-    left = np.angle(np.exp(1j * (phase + TWO_PI * tones_hz * best)))
-    return best - float(np.sum(left * tones_hz) / np.sum(TWO_PI * tones_hz**2))
+    remaining = np.angle(np.exp(1j * (phase + TWO_PI * tones_hz * best)))
+    return best - float(np.sum(remaining * tones_hz) / np.sum(TWO_PI * tones_hz**2))
 
 
 def coil_phase(
@@ -191,7 +193,7 @@ def coil_phase(
             partial(cost, k), -LARGEST_ADVANCE, LARGEST_ADVANCE, 0.1 * DEGREE
         )
         after = trial(advanced(k, angle))
-        result = _said(
+        result = _explanation(
             known,
             after,
             1,

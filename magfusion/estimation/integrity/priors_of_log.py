@@ -11,15 +11,15 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
-from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
-from magfusion.estimation.integrity.released_fault import ReleasedFault
-from magfusion.estimation.integrity.suspects import (
+from magfusion.estimation.integrity.fault_candidates import (
     RARE,
     TILT,
     TYPICAL_TILT,
-    Suspect,
+    FaultCandidate,
     survey_tilt,
 )
+from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
     BEACON_POSITION,
@@ -79,7 +79,7 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
     gain = float(np.sum(along**2 / information))
     count = len(case.pose_cov)
     cause = ReleasedFault(
-        Suspect("the vertical of the survey", surveyed, tilt, TILT, RARE),
+        FaultCandidate("the vertical of the survey", surveyed, tilt, TILT, RARE),
         step=tilt @ turn @ (along / information),
         direction=tilt @ turn,
         information=information,

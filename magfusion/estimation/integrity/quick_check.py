@@ -16,8 +16,12 @@ from magfusion.estimation.data_checks.still_means import StillMeans, still_means
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_explaining_cause
-from magfusion.estimation.integrity.likely_cause import (
+from magfusion.estimation.integrity.fault_isolation import (
+    Diagnosis,
+    diagnosed,
+    with_explaining_cause,
+)
+from magfusion.estimation.integrity.hypothesis_tests import (
     QUANTISED,
     coarse_steps,
     distorted_by,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
+from magfusion.estimation.integrity.fault_candidates import LARGEST, USUAL, FaultCandidate
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import LARGEST, USUAL, Suspect
 from magfusion.model.parameters import AidingParameter
 from magfusion.model.parameters.inertial import GRAVITY, Inertial
 from magfusion.units import Array
@@ -21,7 +21,7 @@ PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the pri
 class ReleaseGain:
     """A candidate fault with its parameters estimated."""
 
-    fault: Suspect
+    fault: FaultCandidate
     step: Array  # (h,), in typical errors
     # direction, information, along: (h, k), (k,), (k,), orthogonal combinations of the fixed
     # parameters, the log's information on each, and the gradient along it
@@ -120,7 +120,7 @@ def _evidence(along: Array, information: Array) -> Array:
     return along**2 / (information + prior) - np.log1p(information / prior)
 
 
-def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
+def release_gain(fault: FaultCandidate, information: Array, gradient: Array) -> ReleaseGain | None:
     """Return the gain of estimating a candidate fault; None without information on it."""
     combine = fault.combine
     value, vector = np.linalg.eigh(combine.T @ information @ combine)
@@ -134,7 +134,7 @@ def release_gain(fault: Suspect, information: Array, gradient: Array) -> Release
 
 
 def release_fault(
-    pose_cov: Array, score: Score, fault: Suspect, information: Array, gradient: Array
+    pose_cov: Array, score: Score, fault: FaultCandidate, information: Array, gradient: Array
 ) -> ReleasedFault | None:
     """Estimate a candidate fault; None without information on it."""
     reported = release_gain(fault, information, gradient)

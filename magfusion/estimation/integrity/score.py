@@ -20,6 +20,7 @@ from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, 
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.measurement import Rows
 from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.integrity.fault_candidates import TOLERANCE, fixed_blocks
 from magfusion.estimation.integrity.fixed_parameter_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
     FixedParameterResidual,
@@ -27,7 +28,6 @@ from magfusion.estimation.integrity.score_chain import (
     left_of_chain,
     responses_of_chain,
 )
-from magfusion.estimation.integrity.suspects import TOLERANCE, held_blocks
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.marginals import is_chain
@@ -122,7 +122,7 @@ def scores_of(
     if not known.platform.inertial and len(known.beacons) == 1:
         return None  # a single beacon is only contradicted by the smoothness of the path
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
-    fixed = held_blocks(known, result.blocks, steady=steady)
+    fixed = fixed_blocks(known, result.blocks, steady=steady)
     if not fixed:
         return None
     every = placed((*fixed, *columns))

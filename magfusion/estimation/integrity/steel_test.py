@@ -11,11 +11,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.integrity.fault_candidates import fault_candidates
 from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, MARGIN
-from magfusion.estimation.integrity.likely_cause import world_model_error
+from magfusion.estimation.integrity.hypothesis_tests import world_model_error
 from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
-from magfusion.estimation.integrity.suspects import suspects
 from magfusion.estimation.integrity.test_result import Case, TestResult
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.steel import (
@@ -126,7 +126,7 @@ def _best_parameter(case: Case) -> float:
     if case.score is None:
         return 0.0
     declared = case.score.with_declared(tolerance=False)
-    every = suspects(case.result.declared.site, case.score.fixed)
+    every = fault_candidates(case.result.declared.site, case.score.fixed)
     return max(
         (one.gain for fault in every if (one := release_gain(fault, *declared))), default=0.0
     )

@@ -20,9 +20,9 @@ from magfusion.estimation.integrity.change_detection import (
     step_of,
     step_time,
 )
+from magfusion.estimation.integrity.fault_candidates import FaultCandidate
 from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
 from magfusion.estimation.integrity.released_fault import gains
-from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.model.parameters import BEACON_POSITION, BEACON_ROTATION, Block
 from magfusion.model.parameters.inertial import ACCEL_BIAS, GYRO_BIAS
@@ -101,7 +101,9 @@ class RecentSteps:
     def _blocks(self, onset: float) -> list[Block]:
         return [step_of(kind, owner, onset) for kind, owner in self._steps]
 
-    def candidates(self, steps: list[Block], information: Array, gradient: Array) -> list[Suspect]:
+    def candidates(
+        self, steps: list[Block], information: Array, gradient: Array
+    ) -> list[FaultCandidate]:
         """Return what one event may have moved, where there is evidence for one of so many."""
         events = list(self._events(steps))
         result, price = [], 2.0 * np.log(max(len(events), 1))
@@ -111,7 +113,7 @@ class RecentSteps:
             gain = gains(np.eye(len(rows))[None], own, gradient[rows])
             if gain[0] > LEAST_EVIDENCE + price:
                 combine = np.eye(len(gradient))[:, rows]
-                result.append(Suspect(changed_name(moved), moved, combine, CHANGED))
+                result.append(FaultCandidate(changed_name(moved), moved, combine, CHANGED))
         return result
 
     def _events(self, steps: list[Block]) -> Iterator[tuple[Block, ...]]:

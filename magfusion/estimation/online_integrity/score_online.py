@@ -16,6 +16,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.estimation.integrity.change_detection import CHANGED, change_finding
 from magfusion.estimation.integrity.correction import Correction, Rival, corrections, open_rivals
+from magfusion.estimation.integrity.fault_candidates import FaultCandidate
 from magfusion.estimation.integrity.fixed_parameter_test import (
     LEAST_EVIDENCE,
     NamedCause,
@@ -25,7 +26,6 @@ from magfusion.estimation.integrity.fixed_parameter_test import (
 from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.steel_test import STEEL, steel_of_score
-from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.steel import region_modes
 from magfusion.estimation.online_integrity.judgement import Judgement
@@ -232,7 +232,7 @@ class OnlineScore:
             by[MOTION:],
         )
 
-        def candidates(information: Array, gradient: Array) -> list[Suspect]:
+        def candidates(information: Array, gradient: Array) -> list[FaultCandidate]:
             gained = np.flatnonzero(targets.gains(information, gradient) > 0.0)
             known = [targets.fault_candidates[k] for k in gained.tolist()]
             fixed = [one._replace(combine=np.pad(one.combine, more)) for one in known]

@@ -8,8 +8,12 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.integrity.fault_candidates import (
+    FaultCandidate,
+    fault_candidates,
+    fixed_blocks,
+)
 from magfusion.estimation.integrity.released_fault import gains
-from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.parameters import BeaconParameter, Block, dimension, placed, prior_sigma
@@ -42,7 +46,7 @@ class ScoreTargets:
         steady: bool,
         steel: tuple[Block, ...] = (),
     ) -> None:
-        fixed = held_blocks(site, estimated, steady=steady)
+        fixed = fixed_blocks(site, estimated, steady=steady)
         self.site, self.fixed_blocks, self.steel = site, placed((*fixed, *steel)), steel
         self.names = tuple(beacon.name for beacon in site.beacons)
         self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)
@@ -60,9 +64,9 @@ class ScoreTargets:
         self.rest = _columns(among)
 
     @cached_property
-    def fault_candidates(self) -> tuple[Suspect, ...]:
+    def fault_candidates(self) -> tuple[FaultCandidate, ...]:
         """Candidate faults of these parameters, created on demand."""
-        return tuple(suspects(self.site, self.fixed_blocks))
+        return tuple(fault_candidates(self.site, self.fixed_blocks))
 
     @cached_property
     def _by_shape(self) -> list[tuple[list[int], IntArray, Array]]:

@@ -11,15 +11,15 @@ from mistake_list import MISTAKES
 
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.demodulation.demodulation import demodulated
-from magfusion.estimation.integrity.diagnosis import (
+from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.fault_isolation import (
     diagnosed,
     seen_in_streams,
     with_cause,
     with_explaining_cause,
 )
-from magfusion.estimation.integrity.explanation import Explanation, clearly_best
 from magfusion.estimation.integrity.field_snapshots import snapshots_of
-from magfusion.estimation.integrity.likely_cause import cause_of
+from magfusion.estimation.integrity.hypothesis_tests import cause_of
 from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.model.parameters import initial_calibration

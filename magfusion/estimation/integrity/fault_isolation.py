@@ -1,7 +1,7 @@
-"""The likely cause of a doubtful or failed result, of what people get wrong.
+"""Isolate the fault of a doubtful or failed result, among usual mistakes.
 
-Where a witness says that something is wrong, and the streams do not show a cause themselves, the
-usual mistakes are tried; see `likely_cause`.
+Where a test contradicts a result, and the streams do not show a cause themselves, the usual
+mistakes are tried; see `hypothesis_tests`.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from magfusion.estimation.data_checks.body_iron import EXPLAINED, IRON_SPAN, fit
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.integrity.explanation import Explanation
-from magfusion.estimation.integrity.likely_cause import OF_MOTION, cause_of
+from magfusion.estimation.integrity.hypothesis_tests import OF_MOTION, cause_of
 from magfusion.estimation.integrity.steel_test import STEEL
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.samples import Log
@@ -36,8 +36,8 @@ OF_SAMPLES = {
     "stuck_axis",
 }
 # What the streams show themselves, which comes before what follows of it.
-# What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
-OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
+# What gravity, static field and gyroscope show clearly where they fail a log, with any effect.
+OF_GRAVITY_AND_FIELD = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
 # Of these a sensor measures nothing, or in another unit, and whatever follows is of that.
 NOT_MEASURED = {"frozen_imu", "frozen_magnetometer", "range_switched", "saturated", "stuck_axis"}
 # What follows of a field that is not as declared, wherever it comes from.
@@ -61,8 +61,8 @@ SEEN = OF_SAMPLES | {
 SHOWN_BY = {"accel_units": ("gravity_missing",), "imu_axes": ("gyro_sign", "gravity_sign")}
 CLEAR = 30.0  # ratio of chi square
 CAUSE_FIRST = 1e6  # weight: a cause comes before what it causes
-OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be beside it
-# But what only says where something is wrong may be of what they show.
+OF_SEEN = CAUSE_FIRST / 2.0  # and before what the streams show, which may be another fault
+# A finding that only localises a fault may be an effect of what they show.
 OF_CATCH_ALL = CAUSE_FIRST / 4.0
 
 
@@ -73,7 +73,7 @@ class Diagnosis(NamedTuple):
     """The mistake that explains a log."""
 
     finding: Finding
-    site: Site | None  # in which it is undone, where it can be
+    site: Site | None  # in which it is corrected, where it can be
     ratio: float  # of chi square before to that after
     is_estimate: bool = False  # whether it has estimated values of parameters
     rival: "Diagnosis | None" = None  # as of `Explanation`, with its probability
@@ -88,15 +88,15 @@ class Diagnosis(NamedTuple):
 def diagnosed(
     log: Log, site: Site, trust: Trust, settings: LockinSettings | None = None
 ) -> Diagnosis | None:
-    """Return the cause of what the witnesses say, where one explains the log.
+    """Return the cause of what the tests contradict, where one explains the log.
 
-    `trust`: what they say; where it is trustworthy, nothing is tried, and only what is clear
+    `trust`: their findings; where it is trustworthy, nothing is tried, and only what is clear
     outweighs steel. Of what the streams show themselves only the correction is sought. `settings`:
     of the estimator.
     """
     if trust.verdict is Verdict.TRUSTWORTHY:
         return None
-    shown = shown_by_compasses(trust)
+    shown = shown_by_gravity_and_field(trust)
     if seen_in_streams(trust) and not shown:
         return None
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
@@ -108,12 +108,12 @@ def diagnosed(
     log, site = first_magnetometer(log, site)
     # Of all that can be wrong nothing is needed where nothing is.
     try:
-        said = cause_of(log, site, settings)
+        explained = cause_of(log, site, settings)
     except (EstimationError, InputError, np.linalg.LinAlgError):
         return None  # a log of which nothing can be tried
-    if said is None:
+    if explained is None:
         return None
-    one, text = said
+    one, text = explained
     if shown and not shown & {one.code, *SHOWN_BY.get(one.code, ())}:
         return None
     parts = trust.verdict, log, site
@@ -141,28 +141,28 @@ def _with_offset(log: Log, site: Site) -> Site:
 def _diagnosis(
     one: Explanation, text: str, verdict: Verdict, log: Log, declared: Site, *, several: bool
 ) -> Diagnosis:
-    """Return an explanation as a finding; what several magnetometers share is not undone."""
+    """Return an explanation as a finding; what several magnetometers share is not corrected."""
     weight = OF_CATCH_ALL if one.catch_all else CAUSE_FIRST
-    undone = None if several else one.site
-    if undone is not None and one.code == MATRIX_OFF:
-        undone = _with_offset(log, undone)
-    remedy = None if undone is None else changed_keys(declared, undone)
+    corrected = None if several else one.site
+    if corrected is not None and one.code == MATRIX_OFF:
+        corrected = _with_offset(log, corrected)
+    remedy = None if corrected is None else changed_keys(declared, corrected)
     finding = Finding(one.code, text, verdict, weight, remedy=remedy or None)
     ratio = one.before / max(one.after, 1e-9)
-    return Diagnosis(finding, undone, ratio, one.found > 0)
+    return Diagnosis(finding, corrected, ratio, one.parameter_count > 0)
 
 
 def seen_in_streams(trust: Trust) -> bool:
     """Return whether the raw streams show a cause themselves, so that no other is looked for."""
-    return bool(shown_by_compasses(trust)) or any(
+    return bool(shown_by_gravity_and_field(trust)) or any(
         f.code in OF_SAMPLES and f.verdict is not Verdict.TRUSTWORTHY for f in trust.findings
     )
 
 
-def shown_by_compasses(trust: Trust) -> set[str]:
+def shown_by_gravity_and_field(trust: Trust) -> set[str]:
     """Return the codes by which gravity, field and gyroscope fail a log."""
     failed = (f.code for f in trust.findings if f.verdict is Verdict.FAILED)
-    return OF_COMPASSES.intersection(failed)
+    return OF_GRAVITY_AND_FIELD.intersection(failed)
 
 
 def _is_wrong_throughout(trust: Trust) -> bool:
@@ -170,7 +170,7 @@ def _is_wrong_throughout(trust: Trust) -> bool:
 
     No parameter changed meanwhile: a step explains a part of anything.
     """
-    codes = {*OF_COMPASSES, "magnetometer_axes", "mounting"}
+    codes = {*OF_GRAVITY_AND_FIELD, "magnetometer_axes", "mounting"}
     return any(
         f.code in NOT_MEASURED or (f.code in codes and f.verdict is Verdict.FAILED)
         for f in trust.reasons
@@ -197,9 +197,9 @@ def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
 
 
 def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
-    """Return the findings on a result that is not solved again with its cause undone.
+    """Return the findings on a result that is not solved again with its cause corrected.
 
-    Reasons that a mistake explains are listed with it, not beside it.
+    Reasons that a mistake explains are listed under it.
     """
     trust = with_cause(trust, cause)
     if cause is None:
@@ -210,10 +210,10 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
         first = cause.finding
     if first is None:
         return trust
-    # What only says where something is wrong explains no more than what follows of it there.
+    # A finding that only localises a fault explains no more than its effects there.
     every = first.code in NOT_MEASURED or (cause is not None and first.weight >= CAUSE_FIRST)
 
-    # Where hardly anything is left, or one instrument's range, no parameter has changed in the log.
+    # Where little misfit remains, or one instrument's range, no parameter has changed in the log.
     is_clear = first.code == "range_switched" or (cause is not None and cause.is_clear)
     seen = SEEN - {"changed"} if is_clear else SEEN
 

@@ -1,7 +1,7 @@
-"""What may be wrong with what an estimator takes for granted: every parameter that it holds.
+"""Candidate faults of what an estimator does not estimate: every fixed parameter.
 
-Beside the calibration parameters of the site there are some that no site declares, of the inertial
-sensors: for those the score of `magfusion.estimation.integrity.score` is the only witness.
+Besides the calibration parameters of the site there are some that no site declares, of the inertial
+sensors: for those the score of `magfusion.estimation.integrity.score` is the only test.
 """
 
 from collections.abc import Iterator
@@ -160,12 +160,12 @@ RARELY_WRONG: tuple[Parameter, ...] = (GYRO_ALIGNMENT, GYRO_G_SENSITIVITY, GRAVI
 TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned by more
 
 
-class Suspect(NamedTuple):
+class FaultCandidate(NamedTuple):
     """Parameters that one mistake would have wrong together."""
 
     name: str  # in words
-    blocks: tuple[Block, ...]  # among those that are held
-    # (dimension, columns), directions that are tried, of all that is held, in units of what is
+    blocks: tuple[Block, ...]  # among those that are fixed
+    # (dimension, columns), directions that are tried, of all that is fixed, in units of what is
     # typical
     combine: Array
     code: str = ""  # of its finding; otherwise that of the first block's parameter
@@ -177,7 +177,7 @@ class Suspect(NamedTuple):
         return self.code or CODE[self.blocks[0].parameter]
 
 
-def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
+def fixed_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
     """Return every parameter that is not estimated, with its typical error for a sigma.
 
     `steady`: whether the static field is measured.
@@ -185,7 +185,7 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
     known = {block.key for block in estimated}
     every = (*PARAMETERS, *INERTIAL)
     if not site.platform.inertial:
-        # What moves steadily need not be where the platform's axes are said to be.
+        # What moves steadily need not be where the platform's axes are declared.
         of_imu = (TIME_OFFSET, CLOCK_RATE, SENSOR_ROTATION, SENSOR_POSITION)
         every = tuple(p for p in PARAMETERS if p not in of_imu)
     if not conductivity_of(site):
@@ -200,60 +200,60 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
     )
 
 
-def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
+def fault_candidates(site: Site, fixed: tuple[Block, ...]) -> Iterator[FaultCandidate]:
     """Yield what one mistake would have wrong: a block, or several of a kind."""
-    size = held[-1].columns.stop if held else 0
+    size = fixed[-1].columns.stop if fixed else 0
 
-    def together(name: str, chosen: list[Block]) -> Suspect:
+    def together(name: str, chosen: list[Block]) -> FaultCandidate:
         columns = np.concatenate([np.arange(size)[b.columns] for b in chosen])
-        return Suspect(name, tuple(chosen), np.eye(size)[:, columns])
+        return FaultCandidate(name, tuple(chosen), np.eye(size)[:, columns])
 
-    for block in held:
+    for block in fixed:
         if not isinstance(block.parameter, SteelModes):  # `steel_test` has those
             odds = RARE if block.parameter in RARELY_WRONG else 1.0
-            yield together(spoken_name(block), [block])._replace(odds=odds)
+            yield together(display_name(block), [block])._replace(odds=odds)
     poses = {b.name: f"the pose of beacon {b.name}" for b in site.beacons}
     sets = {
         f"the positions of {_beacons(site)}": (BEACON_POSITION,),
         f"the attitudes of {_beacons(site)}": (BEACON_ROTATION,),
         f"the moments of {_beacons(site)}": (LOG_MOMENT,),
     }
-    several = [(name, [b for b in held if b.parameter in kinds]) for name, kinds in sets.items()]
-    mounted = [b for b in held if b.parameter in (SENSOR_ROTATION, SENSOR_POSITION)]
+    several = [(name, [b for b in fixed if b.parameter in kinds]) for name, kinds in sets.items()]
+    mounted = [b for b in fixed if b.parameter in (SENSOR_ROTATION, SENSOR_POSITION)]
     for owner in dict.fromkeys(block.owner for block in mounted):
         own = [block for block in mounted if block.owner == owner]
         several.insert(0, (f"the mounting and the lever arm of {_sensor(owner)}", own))
-    surveyed = [b for b in held if b.parameter in (BEACON_ROTATION, BEACON_POSITION)]
+    surveyed = [b for b in fixed if b.parameter in (BEACON_ROTATION, BEACON_POSITION)]
     several += [(text, [b for b in surveyed if b.owner == name]) for name, text in poses.items()]
     yield from (together(name, blocks) for name, blocks in several if len(blocks) > 1)
-    yield from _common(site, held, size)
+    yield from _common(site, fixed, size)
     if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
         blocks = tuple(surveyed)
         tilt = survey_tilt(site, blocks, size)
-        yield Suspect("the vertical of the survey", blocks, tilt, TILT, RARE)
+        yield FaultCandidate("the vertical of the survey", blocks, tilt, TILT, RARE)
     places = tuple(b for b in surveyed if b.parameter == BEACON_POSITION)
     if len(places) == len(site.beacons) > 1:
         stretch = survey_scale(site, places, size)
-        yield Suspect("the scale of the survey", places, stretch, STRETCH)
+        yield FaultCandidate("the scale of the survey", places, stretch, STRETCH)
 
 
-def _common(site: Site, held: tuple[Block, ...], size: int) -> Iterator[Suspect]:
-    """Yield what would have a number of all beacons wrong alike."""
+def _common(site: Site, fixed: tuple[Block, ...], size: int) -> Iterator[FaultCandidate]:
+    """Yield what would have one number of all beacons wrong by the same amount."""
     # That of the magnetometer has the same effect.
     scale = f"the scale of the fields of {_beacons(site)}"
     kinds: dict[str, tuple[Parameter, str]] = {scale: (LOG_MOMENT, FIELD_SCALE)}
     if not site.platform.further:
         kinds["the sampling rate of the magnetometer"] = (DRIFT, SAMPLE_RATE)
     for name, (parameter, code) in kinds.items():
-        own = tuple(b for b in held if b.parameter == parameter)
+        own = tuple(b for b in fixed if b.parameter == parameter)
         if len(own) > 1:
             common = np.zeros((size, 1))
             for block in own:
                 common[block.columns] = 1.0
-            yield Suspect(name, own, common, code)
-    phases = tuple(block for block in held if block.parameter == PHASE)
+            yield FaultCandidate(name, own, common, code)
+    phases = tuple(block for block in fixed if block.parameter == PHASE)
     if len(phases) > 1:
-        yield Suspect(
+        yield FaultCandidate(
             "the epoch of the drive phases", phases, epoch_shift(site, phases, size), EPOCH_SHIFT
         )
 
@@ -306,7 +306,7 @@ def _sensor(owner: str) -> str:
     return "the magnetometer" if owner in ("sensor", "magnetometer") else f"magnetometer {owner}"
 
 
-def spoken_name(block: Block) -> str:
+def display_name(block: Block) -> str:
     """Return what a block is called in a sentence."""
     names = {
         SENSOR_ROTATION: "the mounting of the magnetometer",
@@ -335,7 +335,7 @@ def spoken_name(block: Block) -> str:
         CONDUCTIVITY: "the conductivity of the ground",
     }
     own = block.owner if isinstance(block.parameter, BeaconParameter) else ""
-    spoken = names.get(block.parameter, block.name).format(owner=own)
+    text = names.get(block.parameter, block.name).format(owner=own)
     if isinstance(block.parameter, MagnetometerParameter):
-        return spoken.replace("the magnetometer", _sensor(block.owner))
-    return spoken
+        return text.replace("the magnetometer", _sensor(block.owner))
+    return text

@@ -1,11 +1,10 @@
-"""What the gyroscope and the static field say against each other: axes, signs, units, clocks."""
+"""Consistency of gyroscope and static field: axes, signs, units, clocks."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
-from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
-from magfusion.estimation.data_checks.turning import (
+from magfusion.estimation.data_checks.field_rotation import (
     CONTRADICTED,
     EXPLAINED,
     LEAST_TURN,
@@ -16,17 +15,18 @@ from magfusion.estimation.data_checks.turning import (
     rotation_in,
     turning,
 )
+from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, Array
 
 NOT_AT_ALL = 5.0  # times more slowly than the gyroscope says, a field stands still
-BETTER = 2.0  # times less is left by what is named than by the next
+BETTER = 2.0  # times less misfit by the first explanation than by the next
 LEAST_LAG = 0.03  # s
 LAG_LIMIT = 4.0  # sigma of the declared time offset
 LEAST_ANGLE = 6.0 * DEGREE
-# Deviation of the gyroscope's scale from which it is said; iron on the body looks like tenths.
+# Least deviation of the gyroscope's scale that is reported; iron on the body looks like tenths.
 SCALE = 0.5
 SCALE_EXPLAINED = 0.9  # of the turn by it
 
@@ -40,34 +40,34 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
         return
     time, field = log.vectors.time, field_body(log, site)
     offset = 0.0 if site is None else site.platform.imu.time_offset
-    found = turning(log.imu, time, field, offset)
-    if len(found.change) < 12:
+    rotation = turning(log.imu, time, field, offset)
+    if len(rotation.change) < 12:
         return
-    if not found.speed > LEAST_TURN:
-        yield from _turns_alone(log, site, found)
+    if not rotation.speed > LEAST_TURN:
+        yield from _turns_alone(log, site, rotation)
         return
     if site is None:
         # Of unknown axes the best there are.
-        best = max(axes(), key=found.agreement)
-        if found.agreement(best) > EXPLAINED:
+        best = max(axes(), key=rotation.agreement)
+        if rotation.agreement(best) > EXPLAINED:
             field = field @ (best if np.linalg.det(best) > 0.0 else -best)
-            found = turning(log.imu, time, field, offset)
-    scaled = found.explained(found.scale * np.eye(3))
+            rotation = turning(log.imu, time, field, offset)
+    scaled = rotation.explained(rotation.scale * np.eye(3))
     # Noise in the rates lets the scale seem smaller, noise in the field the inverse.
-    apart = min(abs(found.scale - 1.0), abs(found.scale / max(scaled, 1e-6) - 1.0))
-    if apart > SCALE and scaled > SCALE_EXPLAINED:
-        yield _other_scale(found.scale, scaled)
+    deviation = min(abs(rotation.scale - 1.0), abs(rotation.scale / max(scaled, 1e-6) - 1.0))
+    if deviation > SCALE and scaled > SCALE_EXPLAINED:
+        yield _other_scale(rotation.scale, scaled)
         return
     clock = Clocks(log, time, field, offset)
     sigma = 0.01 if site is None else site.platform.imu.time_offset_sigma
-    late = _other_clock(clock, found, max(LEAST_LAG, LAG_LIMIT * sigma), offset)
+    late = _other_clock(clock, rotation, max(LEAST_LAG, LAG_LIMIT * sigma), offset)
     if late is not None:
         yield late
-    elif found.explained(np.eye(3)) > CONTRADICTED:
-        yield from _turned_little(found, site)
+    elif rotation.explained(np.eye(3)) > CONTRADICTED:
+        yield from _turned_little(rotation, site)
     else:
-        left_handed = None if site is None else _left_handed(log, site, found)
-        yield from _contradicted(found) if left_handed is None else (left_handed,)
+        left_handed = None if site is None else _left_handed(log, site, rotation)
+        yield from _contradicted(rotation) if left_handed is None else (left_handed,)
 
 
 def left_handed_field(log: Log, site: Site) -> Finding | None:
@@ -79,8 +79,8 @@ def left_handed_field(log: Log, site: Site) -> Finding | None:
 def _left_handed(log: Log, site: Site, rotation: FieldRotation) -> Finding | None:
     """Return which axes of a field are reversed, by its rotation and by its angle to gravity.
 
-    A field and its opposite rotate alike: reversed axes and a mounting by half a turn differ in the
-    angle between field and gravity, of which the Earth's field gives the sign.
+    A field and its opposite rotate by the same turns: reversed axes and a mounting by half a turn
+    differ in the angle between field and gravity, of which the Earth's field gives the sign.
     """
     earth = site.earth_field_world
     signs = [one for one in axes() if np.count_nonzero(np.diagonal(one)) == 3]
@@ -109,18 +109,18 @@ def _left_handed(log: Log, site: Site, rotation: FieldRotation) -> Finding | Non
     )
 
 
-def _contradicted(found: FieldRotation) -> Iterator[Finding]:
+def _contradicted(rotation: FieldRotation) -> Iterator[Finding]:
     """Yield what explains a turn of the field that the gyroscope does not, as declared."""
-    declared = found.explained(np.eye(3))
-    ranked = sorted(axes(), key=found.explained)[::-1]
-    best, explained = ranked[0], found.explained(ranked[0])
+    declared = rotation.explained(np.eye(3))
+    ranked = sorted(axes(), key=rotation.explained)[::-1]
+    best, explained = ranked[0], rotation.explained(ranked[0])
     if explained > EXPLAINED and BETTER * (1.0 - explained) < 1.0 - declared:
-        single = BETTER * (1.0 - explained) < 1.0 - found.explained(ranked[1])
-        yield _other_axes(found, best, single=single)
-    elif found.expected_rate > LEAST_TURN:
+        single = BETTER * (1.0 - explained) < 1.0 - rotation.explained(ranked[1])
+        yield _other_axes(rotation, best, single=single)
+    elif rotation.expected_rate > LEAST_TURN:
         yield Finding(
             "gyro_field",
-            f"gyroscope: {_words(found)}, and no exchange of axes or sign explains more than"
+            f"gyroscope: {_words(rotation)}, and no exchange of axes or sign explains more than"
             f" {_percent(max(explained, 0.0))}. An axis is dead, the clocks differ, or something"
             " magnetic moves with the platform. Compare both at a slow turn about each axis.",
             Verdict.DOUBTFUL,
@@ -128,18 +128,20 @@ def _contradicted(found: FieldRotation) -> Iterator[Finding]:
         )
 
 
-def _words(found: FieldRotation) -> str:
+def _words(rotation: FieldRotation) -> str:
+    share = _percent(rotation.explained(np.eye(3)))
+    speed_deg = rotation.speed / DEGREE
     return (
-        f"as declared, the gyroscope explains {_percent(found.explained(np.eye(3)))} of the turn of"
-        f" the static field (rms {found.speed / DEGREE:.0f} deg/s)"
+        f"as declared, the gyroscope explains {share} of the turn of the static field (rms"
+        f" {speed_deg:.0f} deg/s)"
     )
 
 
-def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]:
+def _turned_little(rotation: FieldRotation, site: Site | None) -> Iterator[Finding]:
     """Yield a mounting that is off by degrees, which explains the turn far better."""
     if site is None:
         return
-    turn, sigma, better = found.mounting()
+    turn, sigma, better = rotation.mounting()
     angle = float(np.linalg.norm(turn))
     known = float(np.max(site.platform.magnetometer.sigma.rotation_sensor))
     least = max(LEAST_ANGLE, DETECTION_SIGMAS * float(np.hypot(known, sigma)))
@@ -156,14 +158,14 @@ def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]
         )
 
 
-def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[Finding]:
-    """Name a gyroscope that turns while the field stands still: a bias, or another unit."""
-    mean, expected = np.mean(log.imu.gyro_body, axis=0), found.expected_rate
+def _turns_alone(log: Log, site: Site | None, rotation: FieldRotation) -> Iterator[Finding]:
+    """Name a gyroscope that rotates while the field does not: a bias, or another unit."""
+    mean, expected = np.mean(log.imu.gyro_body, axis=0), rotation.expected_rate
     words = (
         f"gyroscope: it measures {expected / DEGREE:.2g} deg/s (rms), and the static field does"
         " not rotate"
     )
-    if not expected > max(LEAST_TURN, NOT_AT_ALL * found.speed) or site is None:
+    if not expected > max(LEAST_TURN, NOT_AT_ALL * rotation.speed) or site is None:
         return
     imu = site.platform.imu
     rate_hz = 1.0 / float(np.median(np.diff(log.imu.time)))
@@ -190,11 +192,11 @@ def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[
 
 
 def _other_clock(
-    clock: Clocks, found: FieldRotation, least: float, offset: float
+    clock: Clocks, rotation: FieldRotation, least: float, offset: float
 ) -> Finding | None:
     """Name a shift of the stamps that explains the turn far better, if it is at least so long."""
-    (lag, by_lag), declared = clock.lag(), found.explained(np.eye(3))
-    otherwise = max(found.explained(one) for one in axes()[1:])
+    (lag, by_lag), declared = clock.lag(), rotation.explained(np.eye(3))
+    otherwise = max(rotation.explained(one) for one in axes()[1:])
     if not (
         abs(lag) > least
         and by_lag > max(EXPLAINED, otherwise)
@@ -206,7 +208,7 @@ def _other_clock(
         return Finding(
             "imu_clock",
             f"imu: its clock runs {100.0 * rate:+.2g} % off the magnetometer's, so that the streams"
-            f" drift apart: {_words(found)}. Stamp both streams by one clock, or correct the"
+            f" drift apart: {_words(rotation)}. Stamp both streams by one clock, or correct the"
             " sampling rate with which one was stamped.",
             Verdict.FAILED,
             1e3,
@@ -214,7 +216,7 @@ def _other_clock(
     late = "late" if lag < 0.0 else "early"
     return Finding(
         "time_offset",
-        f"imu: stamped {abs(lag):.2f} s too {late}: {_words(found)}, and {_percent(by_lag)} with"
+        f"imu: stamped {abs(lag):.2f} s too {late}: {_words(rotation)}, and {_percent(by_lag)} with"
         f" its samples shifted by {lag:+.3f} s. Stamp both streams by one clock, or declare"
         f" platform.imu.time_offset_s: {offset + lag:.3f}.",
         Verdict.FAILED,
@@ -240,9 +242,9 @@ def _other_scale(scale: float, explained: float) -> Finding:
     )
 
 
-def _other_axes(found: FieldRotation, matrix: Array, *, single: bool) -> Finding:
+def _other_axes(rotation: FieldRotation, matrix: Array, *, single: bool) -> Finding:
     """Name axes that explain the turn; those of the gyroscope, or of the magnetometer."""
-    words, explained = _words(found), found.explained(matrix)
+    words, explained = _words(rotation), rotation.explained(matrix)
     names = ", ".join(_named(row) for row in matrix)
     if np.linalg.det(matrix) < 0.0 and np.count_nonzero(np.diagonal(matrix)) == 3:
         wrong = ", ".join(a for a, sign in zip("xyz", np.diagonal(matrix), strict=True) if sign < 0)

@@ -39,7 +39,7 @@ from magfusion.units import Array, BoolArray
 
 LONGEST = 100.0  # s; of a longer log parts are tried
 PARTS = 4
-FEWEST = 8  # epochs
+MIN_EPOCHS = 8  # epochs
 LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
 QUANTISED = "quantised"  # code
@@ -50,7 +50,7 @@ STRANGE = 1e3  # and above which it is no field of this site
 def cause_of(
     log: Log, site: Site, settings: LockinSettings | None = None
 ) -> tuple[Explanation, str] | None:
-    """Return the mistake that explains a log, with the sentences that say it.
+    """Return the mistake that explains a log, with the sentences that state it.
 
     Raises InputError, EstimationError where the log holds no field that is usable.
     """
@@ -58,7 +58,7 @@ def cause_of(
     part = _part(log)
     samples = _demodulated(part, site, settings)
     samples = samples.rows(np.asarray(samples.valid.any(axis=1)))
-    if len(samples) < FEWEST:
+    if len(samples) < MIN_EPOCHS:
         return None
     known = snapshots_of(samples, part.imu, site)
     tried = _of_fields(known, samples, _steady(part, site))
@@ -80,7 +80,7 @@ def cause_of(
 def _unexplained(
     known: Snapshots, part: Log, samples: FieldSamples
 ) -> tuple[Explanation, str] | None:
-    """Return what is to be said of fields that no single mistake explains."""
+    """Return the finding on fields that no single mistake explains."""
     before, freedom, excess = known.joint_chi_square, max(known.freedom, 1.0), known.excess
     if excess < MISFIT or not _moves(known):
         return None
@@ -114,7 +114,7 @@ def world_model_error(site: Site, share: float) -> str:
 
 
 def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str | None:
-    """Return what is to be said of fields distorted by the steps of the magnetometer."""
+    """Return the finding on fields that the steps of the magnetometer distort."""
     step = coarse_steps(log, site)
     if step is None or share > distorted_by(step, samples):
         return None
@@ -127,7 +127,7 @@ def coarse_steps(log: Log, site: Site) -> float | None:
     Steps below the noise only add to it; larger ones distort the fields, by less than a step.
     """
     wave, density = log.waveform, site.platform.magnetometer.noise_density
-    if wave is None or len(wave) < FEWEST:
+    if wave is None or len(wave) < MIN_EPOCHS:
         return None
     step = float(np.max(step_of_axes(wave.measured_sensor)))
     rounding = step * np.sqrt(float(np.median(np.diff(wave.time))) / 6.0)  # T/sqrt(Hz), one-sided
@@ -140,7 +140,7 @@ def distorted_by(step: float, samples: FieldSamples) -> float:
 
 
 def of_steps(step: float, share: float, about: str = "about") -> str:
-    """Return what is to be said of steps (T) that distort the fields by a share."""
+    """Return the finding on steps (T) that distort the fields by a share."""
     return (
         f"The magnetometer's steps of {step:.2g} T are larger than its noise, and distort the"
         f" fields by {about} {100.0 * share:.2g} %. Choose a smaller range, or more digits."
@@ -148,20 +148,20 @@ def of_steps(step: float, share: float, about: str = "about") -> str:
 
 
 def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> FieldSamples:
-    """Return phasors turned by the gyro, or by nothing where that leaves less noise.
+    """Return phasors rotated by the gyro, or as they are where their noise is less.
 
     Nothing of the fields may hang on an inertial sensor that is itself in doubt: a gyro whose axes
     or signs are wrong makes more noise of the Earth field than none does.
     """
     still = replace(log, imu=replace(log.imu, gyro_body=np.zeros_like(log.imu.gyro_body)))
-    found = []
+    trials = []
     for one in (log, still):
         samples = demodulated(one, site, settings).fields
         if has_schedule(site):
             samples = whole_cycles(samples, one.imu, site)
         noise = np.trace(samples.phasor_cov, axis1=2, axis2=3)
-        found.append((float(np.nanmedian(noise)), samples))
-    return min(found, key=lambda pair: pair[0])[1]
+        trials.append((float(np.nanmedian(noise)), samples))
+    return min(trials, key=lambda pair: pair[0])[1]
 
 
 def _steady(log: Log, site: Site) -> float | None:
@@ -177,7 +177,7 @@ def _of_fields(known: Snapshots, samples: FieldSamples, steady: float | None) ->
     best = clearly_best(tried)
     if best is None or best.after > ENOUGH * best.expected:
         tried += global_causes(known)
-    # Where the platform stands, and of one beacon that may be wrong in two ways, no more is told.
+    # Of a platform at rest, and of one beacon with two possible faults, no more is known.
     if _moves(known) and not any(one.clear and one.after < known.freedom for one in tried):
         tried += survey_causes(known)
     return tried
@@ -212,8 +212,8 @@ def _part(log: Log) -> Log:
     begins = np.linspace(first, last - LONGEST / PARTS, PARTS)
 
     def within(time: Array) -> BoolArray:
-        since = time[:, None] - begins
-        return np.asarray(np.any((since >= 0.0) & (since < LONGEST / PARTS), axis=1))
+        elapsed = time[:, None] - begins
+        return np.asarray(np.any((elapsed >= 0.0) & (elapsed < LONGEST / PARTS), axis=1))
 
     imu, wave, fields = log.imu, log.waveform, log.fields
     kept = within(imu.time)
