@@ -254,7 +254,7 @@ def report(result: Figures) -> str:
     return "\n".join(
         (
             f"{result.epochs} epochs, {result.faulted} of them with a false beacon;"
-            f" {result.detected:.1%} of these are noticed",
+            f" {result.detected:.1%} of these are findings",
             f"  beyond the level, unseen       {result.unseen}: at most {result.unseen_limit:.2g}"
             f" of the faulty, {result.hazard_limit:.2g} an epoch",
             f"  alarms without a fault         {result.false_alarm_rate:.2g} of the epochs, at most"

@@ -247,7 +247,7 @@ def report(result: Sequence[OnlineOutcome]) -> str:
     worst = max(result, key=lambda one: one.unseen)
     delays = [one.detected for one in result if one.detected is not None]
     lines = [
-        f"{sums.runs} runs with a false beacon; {sums.detected:.0%} noticed, after"
+        f"{sums.runs} runs with a false beacon; {sums.detected:.0%} findings, after"
         f" {np.median(delays) if delays else np.nan:.1f} s (median)",
         f"  beyond the level, unseen       {sums.unseen_runs} runs: at most {sums.unseen_limit:.2g}"
         f" of them, {sums.hazard_limit:.2g} an epoch",

@@ -190,7 +190,7 @@ def test_fixes_of_gnss_are_positions_in_the_tangent_plane(tmp_path):
     bag = write_bag(tmp_path / "bag", SENSORS | {"/gnss": (FIX, lambda k: _fix(k, k % 2 - 1))})
     sensor = AidingSensor("gnss", "position", 1.0, origin=ORIGIN)
     log = read_bag(bag, aiding=(sensor,))
-    assert f"gnss: {N // 2} of {N} messages have no value (no fix)." in log.noticed[0].text
+    assert f"gnss: {N // 2} of {N} messages have no value (no fix)." in log.findings[0].text
     samples = log.aiding["gnss"]
     assert np.allclose(samples.value[:, 0], 0.0, rtol=0.0, atol=1e-9)
     assert np.allclose(samples.value[:, 1], 100.0, rtol=0.0, atol=2e-3)

@@ -318,8 +318,8 @@ def test_samples_without_a_number_or_a_time_of_their_own_are_left_out_and_counte
         for log in (whole, result)
     )
     assert np.array_equal(after, np.delete(before, 9))
-    assert [finding.code for finding in result.noticed] == ["repeated_stamps", "missing_samples"]
-    assert all("1 samples" in finding.text for finding in result.noticed)
+    assert [finding.code for finding in result.findings] == ["repeated_stamps", "missing_samples"]
+    assert all("1 samples" in finding.text for finding in result.findings)
 
 
 @pytest.mark.parametrize(
@@ -342,9 +342,9 @@ def test_rows_of_a_truth_without_a_pose_are_left_out_and_counted(
     assert whole is not None
     assert log.truth is not None
     np.testing.assert_array_equal(log.truth.time, np.delete(whole.time, 9))
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert text in finding.text
-    every = read_trajectory(tmp_path / "walk" / "truth.parquet", log.epoch_ns, noticed=[])
+    every = read_trajectory(tmp_path / "walk" / "truth.parquet", log.epoch_ns, findings=[])
     assert len(every) == len(whole) - 1
 
 
@@ -354,7 +354,7 @@ def test_quaternions_that_are_rounded_are_scaled_and_reported(tmp_path: Path) ->
     log = read_log(tmp_path / "walk")
     assert log.truth is not None
     np.testing.assert_allclose(np.linalg.det(log.truth.world_from_body), 1.0)
-    assert [f.text for f in log.noticed] == [
+    assert [f.text for f in log.findings] == [
         "truth: quaternions up to 0.2 % off were scaled to unit length."
     ]
 

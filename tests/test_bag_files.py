@@ -131,7 +131,7 @@ def test_messages_that_two_bags_share_are_counted_once(tmp_path: Path, refuse: R
     write_ros1_bag(folder / "r_1.bag", SENSORS, range(20, N))
     log = open_log(folder)
     assert_samples(log)
-    texts = [finding.text for finding in log.noticed]
+    texts = [finding.text for finding in log.findings]
     expected = "{}: 10 samples are exact copies of others. They are left out."
     assert texts == [expected.format(name) for name in ("IMU", "magnetometer")]
     by_import, figures = imported(tmp_path / "log", folder)

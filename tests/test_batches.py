@@ -45,7 +45,7 @@ def test_batches_of_a_bag_are_read_at_their_sampling_times(tmp_path: Path) -> No
     bag = _bag(tmp_path / "run")
     log = open_log(bag)
     assert log.epoch_ns == STAMPS[0]
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "repeated_stamps"
     assert "32 of 40 samples have the stamp of the one before, in batches of 5" in finding.text
     by_itself, figures = imported(tmp_path / "log", bag)
@@ -145,7 +145,7 @@ def test_batches_of_a_log_are_read_unless_other_columns_have_their_stamps(
             open_log(tmp_path / "log")
         return
     log = open_log(tmp_path / "log")
-    assert [finding.code for finding in log.noticed] == ["repeated_stamps"] * 2
+    assert [finding.code for finding in log.findings] == ["repeated_stamps"] * 2
     for own in (log.imu.time, log.waveform.time if log.waveform else np.zeros(0)):
         np.testing.assert_allclose(own, time, rtol=0, atol=1e-9)
 

@@ -33,7 +33,7 @@ def test_false_inertial_samples_are_left_out_and_counted() -> None:
     good = clean_log(corrupted, site)
     assert len(log.imu) - len(good.imu) >= 11
     assert not np.isin(log.imu.time[rows], good.imu.time).any()
-    (finding,) = good.noticed
+    (finding,) = good.findings
     assert finding.code == "imu_spikes"
     assert finding.verdict is Verdict.TRUSTWORTHY
     errors = trajectory_errors(smooth(corrupted, site).states, log.truth)
@@ -53,7 +53,7 @@ def test_a_false_magnetometer_sample_is_a_missing_one() -> None:
     good = clean_log(corrupted, site)
     assert good.waveform is not None
     np.testing.assert_array_equal(good.waveform.time, np.delete(log.waveform.time, rows))
-    assert [finding.code for finding in good.noticed] == ["false_samples"]
+    assert [finding.code for finding in good.findings] == ["false_samples"]
 
 
 def test_an_imu_that_hung_is_one_that_fell_silent() -> None:
@@ -66,8 +66,8 @@ def test_an_imu_that_hung_is_one_that_fell_silent() -> None:
     corrupted = replace(log, imu=replace(log.imu, gyro_body=gyro, accel_body=accel))
     good = clean_log(corrupted, site)
     np.testing.assert_array_equal(good.imu.time, np.delete(log.imu.time, np.arange(701, 1000)))
-    assert {finding.code for finding in good.noticed} == {"frozen_imu"}
-    assert all(finding.verdict is Verdict.TRUSTWORTHY for finding in good.noticed)
+    assert {finding.code for finding in good.findings} == {"frozen_imu"}
+    assert all(finding.verdict is Verdict.TRUSTWORTHY for finding in good.findings)
     result = smooth(corrupted, site, SmootherSettings(tune=False))
     errors = trajectory_errors(result.states, log.truth)
     inside = (errors.time > log.imu.time[700]) & (errors.time < log.imu.time[1000])
@@ -118,7 +118,7 @@ def test_few_false_samples_are_left_out_as_many_are(
     log, site = walked(), demo_site(coil_radius=None)
     good = clean_log(with_spikes(log, stream, rows, size, axis=1), site)
     assert missing_rows(log, good, stream) == rows
-    (finding,) = good.noticed
+    (finding,) = good.findings
     assert f" {len(rows)} isolated samples" in finding.text
     assert finding.verdict is Verdict.TRUSTWORTHY
 
@@ -130,7 +130,7 @@ def test_a_false_sample_at_an_end_is_left_out(stream: str, row: int) -> None:
     good = clean_log(with_spikes(log, stream, [row], 35.0), site)
     count = 4800 if stream == "field" else 2400
     assert missing_rows(log, good, stream) == [row % count]
-    assert [f.code for f in good.noticed] == [
+    assert [f.code for f in good.findings] == [
         "false_samples" if stream == "field" else "imu_spikes"
     ]
 
@@ -170,7 +170,7 @@ def test_an_instrument_of_coarse_steps_loses_nothing() -> None:
     gyro[rng.choice(len(gyro), 40, replace=False), 1] = 0.02  # rad/s; one step, now and then
     accel = np.round(log.imu.accel_body, 1)
     coarse = replace(log, imu=replace(log.imu, gyro_body=gyro, accel_body=accel))
-    assert not clean_log(coarse, site).noticed
+    assert not clean_log(coarse, site).findings
 
 
 def test_false_samples_beside_lost_ones_are_left_out() -> None:
@@ -180,7 +180,7 @@ def test_false_samples_beside_lost_ones_are_left_out() -> None:
     rng = np.random.default_rng(5)
     kept = np.sort(rng.choice(len(wave), int(0.95 * len(wave)), replace=False))
     lost = replace(log, waveform=wave.rows(kept))
-    assert not [f for f in clean_log(lost, site).noticed if f.code == "false_samples"]
+    assert not [f for f in clean_log(lost, site).findings if f.code == "false_samples"]
     good = clean_log(with_spikes(lost, "field", [900], 1e-3), site)
     assert missing_rows(lost, good, "field") == [900]
 
@@ -205,10 +205,10 @@ def test_a_number_that_no_instrument_gives_is_a_missing_sample(name: str, tmp_pa
     read = open_log(tmp_path / "log")
     stream = "field" if name == "magnetometer" else "gyro"
     assert missing_rows(log, read, stream) == rows
-    (finding,) = read.noticed
+    (finding,) = read.findings
     assert finding.code == "missing_samples"
     assert "4 samples are larger than any instrument measures" in finding.text
-    assert not clean_log(read, site).noticed[1:]
+    assert not clean_log(read, site).findings[1:]
 
 
 RANGES = {"gyro": 6.0, "accel": 30.0, "field": 2e-4}  # rad/s, m/s^2, T: of the walk, and no more
@@ -228,7 +228,7 @@ def test_a_sample_beyond_the_declared_range_is_a_missing_one(stream: str) -> Non
     corrupted = _set(log, stream, rows, -beyond)
     ranged = clean_log(corrupted, _ranged(site))
     assert missing_rows(log, ranged, stream) == rows
-    (finding,) = ranged.noticed
+    (finding,) = ranged.findings
     assert (finding.code, finding.verdict) == ("missing_samples", Verdict.TRUSTWORTHY)
     assert "8 samples are beyond the range" in finding.text
     clipped = clean_log(_set(log, stream, rows[:7], RANGES[stream]), _ranged(site))

@@ -127,11 +127,11 @@ def test_a_column_in_milliamperes_is_said(wandering: Log) -> None:
     assert wandering.drive is not None
     wrong = {name: 1e3 * values for name, values in wandering.drive.current.items()}
     log, _ = with_drives(replace(wandering, drive=replace(wandering.drive, current=wrong)), SITE)
-    result = [f for f in log.noticed if f.code == "drive_current"]
+    result = [f for f in log.findings if f.code == "drive_current"]
     assert len(result) == 4
     assert "times that of its declared moments" in result[0].text
     log, _ = with_drives(wandering, SITE)
-    assert not [f for f in log.noticed if f.code == "drive_current"]
+    assert not [f for f in log.findings if f.code == "drive_current"]
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_online_a_column_in_milliamperes_is_said_as_offline(wandering: Log) -> N
     navigator.add_drive(currents)
     findings = [finding.text for finding in navigator.of_currents]
     assert len(findings) == 4
-    assert findings == [f.text for f in with_drives(offline, SITE)[0].noticed]
+    assert findings == [f.text for f in with_drives(offline, SITE)[0].findings]
 
 
 def test_a_run_goes_on_with_its_currents(wandering: Log) -> None:

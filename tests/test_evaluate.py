@@ -330,7 +330,7 @@ def test_the_truth_of_euroc_is_read_and_other_heads_are_for_import(
     lines = [f"{t},{','.join(map(str, row))}" for t, row in zip(stamps, poses, strict=True)]
     lines[5] = f"{stamps[5]},nan,nan,nan,nan,nan,nan,nan"
     (tmp_path / "t.csv").write_text("\n".join([head, *lines]))
-    read = read_any_poses(tmp_path / "t.csv", noticed=[])
+    read = read_any_poses(tmp_path / "t.csv", findings=[])
     np.testing.assert_allclose(read.position_world, np.delete(walked.position_world, 5, axis=0))
     np.testing.assert_allclose(read.world_from_body[0], walked.world_from_body[0], atol=1e-12)
     (tmp_path / "t.csv").write_text("\n".join(["a,b,c,d,e,f,g,h", *lines]))

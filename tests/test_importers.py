@@ -128,7 +128,7 @@ def test_samples_that_were_not_taken_are_left_out_of_a_euroc_folder_and_said(
     table.write_text("\n".join([head, *rows[:12], rows[11], *rows[12:]]) + "\n")
     log = open_log(tmp_path)
     np.testing.assert_array_equal(log.imu.gyro_body, np.delete(GYRO, 7, axis=0))
-    assert [f.code for f in log.noticed] == ["repeated_stamps", "missing_samples"]
+    assert [f.code for f in log.findings] == ["repeated_stamps", "missing_samples"]
 
 
 def _rewrite(path: Path, write: Callable[[str], str], header: str | None) -> None:
@@ -146,7 +146,7 @@ def test_a_euroc_folder_without_heads_keeps_its_first_rows(tmp_path: Path) -> No
     log = open_log(path)
     _assert_samples(log)
     _assert_truth(log, ROTATION.apply(VELOCITY_BODY))
-    assert not log.noticed
+    assert not log.findings
     run_command("import", path, "-o", tmp_path / "log")
     _assert_samples(read_log(tmp_path / "log"))
 
@@ -183,9 +183,9 @@ def test_stamps_of_a_euroc_folder_are_read_as_what_they_are(
         assert log.waveform is not None
         np.testing.assert_array_equal(log.waveform.measured_sensor, MEASURED)
         _assert_truth(log, ROTATION.apply(VELOCITY_BODY))
-    noticed = [f.text for f in open_log(path).noticed if f.code == "stamp_resolution"]
-    assert len(noticed) == 3
-    assert all(told in text for text in noticed)
+    findings = [f.text for f in open_log(path).findings if f.code == "stamp_resolution"]
+    assert len(findings) == 3
+    assert all(told in text for text in findings)
 
 
 def test_a_row_that_is_cut_off_is_left_out_of_a_euroc_folder_and_counted(tmp_path: Path) -> None:
@@ -193,8 +193,8 @@ def test_a_row_that_is_cut_off_is_left_out_of_a_euroc_folder_and_counted(tmp_pat
     table.write_text(table.read_text()[:-40])
     log = open_log(tmp_path)
     np.testing.assert_array_equal(log.imu.gyro_body, GYRO[:-1])
-    assert [f.code for f in log.noticed] == ["missing_samples"]
-    assert "imu: 1 row does not have as many cells" in log.noticed[0].text
+    assert [f.code for f in log.findings] == ["missing_samples"]
+    assert "imu: 1 row does not have as many cells" in log.findings[0].text
 
 
 @pytest.mark.parametrize("kind", ["bag", "EuRoC"])
@@ -424,19 +424,19 @@ def test_samples_that_were_not_taken_are_left_out_of_a_bag_and_said(
     np.testing.assert_array_equal(log.imu.gyro_body, np.delete(GYRO, 7, axis=0))
     np.testing.assert_array_equal(log.waveform.measured_sensor, np.delete(MEASURED, 21, axis=0))
     np.testing.assert_array_equal(log.truth.position_world, np.delete(POSITION, 7, axis=0))
-    assert [f"{f.code}: {f.text}" for f in log.noticed] == [
+    assert [f"{f.code}: {f.text}" for f in log.findings] == [
         "missing_samples: IMU: 1 samples are NaN. They are left out.",
         "repeated_stamps: magnetometer: 1 samples have the stamp of the one before. They are left"
         " out.",
         "missing_samples: truth: 1 samples are NaN. They are left out.",
     ]
-    assert not open_log(bag, 0.11).noticed
+    assert not open_log(bag, 0.11).findings
     untracked = _changed(pose_message, lambda message: _no_turn(message.pose))
     log = open_log(write_bag(tmp_path / "zeros", SENSORS | {"/mocap": (POSE, untracked)}))
     assert log.truth is not None
     assert len(log.truth) == len(POSITION) - 1
     text = f"truth: left out 1 of {len(POSITION)} rows: 1 with a quaternion of zeros."
-    assert [finding.text for finding in log.noticed] == [text]
+    assert [finding.text for finding in log.findings] == [text]
 
 
 def _stamped(message: Any, k: int) -> Any:

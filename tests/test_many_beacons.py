@@ -156,7 +156,7 @@ def test_what_is_not_heard_stays_as_declared(building: Site, tmp_path: Path) -> 
     assert 3 < len(site.beacons) < 60
     assert log.fields is not None
     assert log.fields.channels == site.channels
-    assert [finding.code for finding in log.noticed] == ["beacons_unheard"]
+    assert [finding.code for finding in log.findings] == ["beacons_unheard"]
     assert site.every_beacon == building.beacons
     save_site(site, tmp_path / "site.yaml")
     again = load_site(tmp_path / "site.yaml")

@@ -64,7 +64,7 @@ def test_repeated_samples_are_left_out_and_counted(
     assert noted.code == "repeated_samples"
     assert f"{np.sum(again)} samples" in noted.text
     assert noted.verdict is Verdict.TRUSTWORTHY
-    assert clean_log(whole, site).noticed == ()
+    assert clean_log(whole, site).findings == ()
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)

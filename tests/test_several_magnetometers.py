@@ -275,8 +275,8 @@ def test_one_that_hears_nothing_is_named_and_left_out() -> None:
     quiet[:, site.of_sensor(1)] = noise[0] + 1j * noise[1]
     log = Log("two", 0, "simulation", NO_SAMPLES, fields=replace(result, phasor_sensor=quiet))
     remaining, alone = without_silent(log, site)
-    assert [finding.code for finding in remaining.noticed] == ["magnetometer_silent"]
-    assert "right detects no beacon in 12 epochs" in remaining.noticed[0].text
+    assert [finding.code for finding in remaining.findings] == ["magnetometer_silent"]
+    assert "right detects no beacon in 12 epochs" in remaining.findings[0].text
     assert [sensor.name for sensor in alone.platform.magnetometers] == ["left"]
     assert remaining.fields is not None
     np.testing.assert_array_equal(remaining.fields.phasor_sensor, quiet[:, site.of_sensor(0)])

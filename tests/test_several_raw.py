@@ -167,7 +167,7 @@ def test_a_fix_of_both_is_near_the_truth(walk: SimulatedLog, site: Site) -> None
 def test_of_one_without_samples_it_is_said(walk: SimulatedLog, site: Site) -> None:
     log = replace(walk.log, waveforms={"right": walk.log.waveforms["right"]})
     result = demodulated_apart(log, site)
-    assert "There are no samples of magnetometer left." in result.noticed[-1].text
+    assert "There are no samples of magnetometer left." in result.findings[-1].text
     assert result.log.fields is not None
     assert not np.any(result.log.fields.valid[:, site.of_sensor(0)])
 

@@ -71,7 +71,7 @@ def test_a_stray_stamp_of_a_bag_is_left_out_and_reported(
 ) -> None:
     bag = _bag(tmp_path / "run", topic, row, shift_s)
     log = open_log(bag)
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "stray_stamps"
     assert finding.text.startswith(f"{ROLES[topic]}: 1 samples have stamps far from")
     by_import, figures = imported(tmp_path / "log", bag)
@@ -105,7 +105,7 @@ def test_a_stray_stamp_of_a_log_is_left_out_wherever_its_row_is(
     before = read_log(tmp_path / "log")
     change_table(table, shift)
     log = read_log(tmp_path / "log")
-    assert [finding.code for finding in log.noticed] == ["stray_stamps"]
+    assert [finding.code for finding in log.findings] == ["stray_stamps"]
     own, whole = (
         (one.imu.time if stream == "imu" else one.waveform.time if one.waveform else None)
         for one in (log, before)
@@ -125,7 +125,7 @@ def test_rows_of_a_log_that_were_written_twice_are_counted(tmp_path: Path, strea
     table = pyarrow.parquet.read_table(path)
     pyarrow.parquet.write_table(table.take(np.repeat(np.arange(len(table)), 2)), path)
     log = read_log(tmp_path / "log")
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "repeated_stamps"
     assert f": {len(table)} samples are exact copies of others" in finding.text
     assert before.truth is not None
@@ -142,7 +142,7 @@ def test_an_infinite_sample_of_a_log_is_a_missing_one(
     write_log(example_log(), tmp_path / "log")
     path = tmp_path / "log" / f"{stream}.parquet"
     change_table(path, lambda columns: columns[name].__setitem__(3, value))
-    (finding,) = read_log(tmp_path / "log").noticed
+    (finding,) = read_log(tmp_path / "log").findings
     assert (finding.code, "1 samples are NaN" in finding.text) == ("missing_samples", True)
 
 
@@ -232,7 +232,7 @@ def test_a_single_stamp_seconds_away_is_left_out(
     by_import, figures = imported(tmp_path / "log", bag)
     assert figures[f"{ROLES[topic].lower()}_dropped_with_a_stray_time"] == 1
     log = open_log(bag)
-    assert [finding.code for finding in log.noticed] == ["stray_stamps"]
+    assert [finding.code for finding in log.findings] == ["stray_stamps"]
     for one in (log, by_import):
         assert one.waveform is not None
         assert one.truth is not None
@@ -256,7 +256,7 @@ def test_messages_without_stamps_have_their_times_of_arrival(tmp_path: Path, sta
     by_import, figures = imported(tmp_path / "log", bag)
     assert any(f"imu: all messages have the stamp {stamp} ns" in note for note in figures["notes"])
     log = open_log(bag)
-    assert [finding.code for finding in log.noticed] == ["repeated_stamps"] * 3
+    assert [finding.code for finding in log.findings] == ["repeated_stamps"] * 3
     for one in (log, by_import):
         assert one.epoch_ns == 10**9
         np.testing.assert_allclose(one.imu.time, 5e-3 * np.arange(N), rtol=0, atol=1e-9)

@@ -113,11 +113,11 @@ def test_a_temperature_in_kelvin_is_refused(tmp_path: Path, warm: Log) -> None:
 
 def test_what_is_declared_and_not_recorded_is_said(warm: Log) -> None:
     log, _ = at_reference(replace(warm, temperatures=None), temperature_site())
-    (finding,) = [f for f in log.noticed if f.code == "temperature_missing"]
+    (finding,) = [f for f in log.findings if f.code == "temperature_missing"]
     assert "beacon A" in finding.text
     assert "the magnetometer" in finding.text
     log, _ = at_reference(warm, temperature_site())
-    assert not [f for f in log.noticed if f.code == "temperature_missing"]
+    assert not [f for f in log.findings if f.code == "temperature_missing"]
 
 
 def test_a_run_that_goes_on_knows_how_warm_it_is() -> None:
@@ -180,4 +180,4 @@ def test_demodulated_phasors_lack_no_temperature(warm: Log, tmp_path: Path) -> N
     )
     assert site.platform.magnetometer.temperature_model is None
     assert all(beacon.temperature_model is not None for beacon in site.beacons)
-    assert not [f for f in log.noticed if f.code == "temperature_missing"]
+    assert not [f for f in log.findings if f.code == "temperature_missing"]

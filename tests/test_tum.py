@@ -44,12 +44,12 @@ def test_evo_s_files_are_read(tmp_path: Path) -> None:
 
 
 def test_lines_that_were_written_twice_are_counted(tmp_path: Path) -> None:
-    trajectory, noticed = _trajectory(), list[Finding]()
+    trajectory, findings = _trajectory(), list[Finding]()
     write_tum(trajectory, path := tmp_path / "t.tum", 0)
     path.write_text("".join(2 * line for line in path.read_text().splitlines(keepends=True)))
-    result = read_tum(path, 0, noticed)
+    result = read_tum(path, 0, findings)
     np.testing.assert_allclose(result.time, trajectory.time, rtol=0, atol=1e-9)
-    (finding,) = noticed
+    (finding,) = findings
     assert finding.text == f"{path}: 4 samples are exact copies of others. They are left out."
     with pytest.raises(InputError, match="increasing times"):
         read_tum(path)
@@ -115,10 +115,10 @@ def test_a_bad_file_is_refused_by_its_line(tmp_path: Path, text: str, sentence: 
 def test_lines_without_a_pose_are_left_out_and_counted(tmp_path: Path, lost: str) -> None:
     lines = [f"{k} {lost if k == 3 else GOOD[4:]}" for k in range(12)]
     (tmp_path / "t.tum").write_text("\n".join(lines))
-    noticed: list[Finding] = []
-    result = read_tum(tmp_path / "t.tum", noticed=noticed)
+    findings: list[Finding] = []
+    result = read_tum(tmp_path / "t.tum", findings=findings)
     np.testing.assert_array_equal(result.time, np.delete(np.arange(12.0), 3))
-    assert noticed[0].text.startswith("t.tum: left out 1 of 12 rows: 1 with")
+    assert findings[0].text.startswith("t.tum: left out 1 of 12 rows: 1 with")
 
 
 @pytest.mark.parametrize(("unit", "zeros"), [("ms", 3), ("us", 6), ("ns", 9)])
@@ -127,10 +127,10 @@ def test_dates_in_smaller_units_are_read_and_reported(
 ) -> None:
     lines = [f"{(1_700_000_000 + k) * 10**zeros} {GOOD[4:]}" for k in range(3)]
     (tmp_path / "t.tum").write_text("\n".join(lines))
-    noticed: list[Finding] = []
-    result = read_tum(tmp_path / "t.tum", 1_700_000_000 * 10**9, noticed)
+    findings: list[Finding] = []
+    result = read_tum(tmp_path / "t.tum", 1_700_000_000 * 10**9, findings)
     np.testing.assert_array_equal(result.time, [0.0, 1.0, 2.0])
-    assert f"t.tum: its times are read as {unit}" in noticed[0].text
+    assert f"t.tum: its times are read as {unit}" in findings[0].text
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:

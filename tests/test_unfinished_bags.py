@@ -52,7 +52,7 @@ def test_messages_in_the_log_of_a_database_are_read(tmp_path: Path, metadata: bo
     for path in (bag, bag / "run.db3"):
         log = open_log(path)
         assert_samples(log)
-        assert not log.noticed
+        assert not log.findings
     assert_samples(imported(tmp_path / "log", bag)[0])
     assert {path.name for path in bag.iterdir()} | {"metadata.yaml"} == names
 
@@ -78,7 +78,7 @@ def test_a_bag_that_is_cut_is_read_up_to_there(tmp_path: Path, kind: str) -> Non
     np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
     assert log.waveform is not None
     np.testing.assert_array_equal(log.waveform.measured_sensor, MEASURED[: N // 2])
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "bag_unfinished"
     assert f"{N + N // 2} messages in 0.195 s are whole" in finding.text
     by_import, figures = imported(tmp_path / "log", path)
@@ -105,7 +105,7 @@ def test_rows_of_a_damaged_database_are_read(tmp_path: Path, damage: str, metada
     measured = log.waveform.measured_sensor
     assert all((row == MEASURED).all(axis=1).any() for row in measured)
     assert N // 2 - 12 <= len(measured) < N  # twelve messages a page
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "bag_damaged"
     assert f"{N + len(measured)} messages in " in finding.text
     by_import, figures = imported(tmp_path / "log", bag)
@@ -120,7 +120,7 @@ def test_a_bag_without_its_end_is_read_whole(tmp_path: Path, kind: str) -> None:
         path.write_bytes(path.read_bytes()[:-lost])
         log = open_log(path)
         assert_samples(log)
-        assert [finding.code for finding in log.noticed] == ["bag_unfinished"]
+        assert [finding.code for finding in log.findings] == ["bag_unfinished"]
 
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
@@ -133,7 +133,7 @@ def test_zeros_behind_what_was_written_are_no_messages(tmp_path: Path, kind: str
     np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
     assert log.waveform is not None
     np.testing.assert_array_equal(log.waveform.measured_sensor[: N // 2], MEASURED[: N // 2])
-    assert [finding.code for finding in log.noticed] == ["bag_unfinished"]
+    assert [finding.code for finding in log.findings] == ["bag_unfinished"]
 
 
 def test_messages_lost_to_damage_are_counted(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_messages_lost_to_damage_are_counted(tmp_path: Path) -> None:
     path.write_bytes(content)
     log = open_log(path)
     np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
-    (finding,) = log.noticed
+    (finding,) = log.findings
     assert finding.code == "bag_damaged"
     assert f"{N // 2 + 1} of {N} messages of /imu/mag are read" in finding.text
     assert str(path) in finding.text

@@ -50,7 +50,7 @@ class _Stream:
     place: str
     time_ns: IntArray
     values: Array
-    noticed: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     left_out: int = 0
     set_back: ClockSetBack | None = None
 
@@ -92,7 +92,7 @@ def read_bag(
     -------
     Log
         Without the streams for which the bag has no topic, and without messages that hold NaN or
-        the stamp of another; ``noticed`` has their number.
+        the stamp of another; ``findings`` has their number.
     """
     with open_bag([path]) as reader:
         result = _read(reader, path, topics or Topics(), report, aiding)
@@ -124,7 +124,7 @@ def read_bag(
         imu=ImuSamples.empty() if imu is None else _imu(imu, span),
         waveform=None if field is None else _waveform(field, span),
         truth=None if truth is None else _trajectory(truth, span, declared),
-        noticed=tuple(declared),
+        findings=tuple(declared),
         aiding=others,
     )
 
@@ -156,8 +156,8 @@ def _read(
         stream = _Stream(_NAMES.get(role, role), one.place, messages.stamps, messages.values)
         if messages.unstamped:
             text = unstamped_text(stream.name, int(messages.stamps[0]))
-            noticed = (Finding("repeated_stamps", text, Verdict.TRUSTWORTHY),)
-            stream = replace(stream, time_ns=messages.arrived, noticed=noticed)
+            findings = (Finding("repeated_stamps", text, Verdict.TRUSTWORTHY),)
+            stream = replace(stream, time_ns=messages.arrived, findings=findings)
         # A receiver of GNSS has no fix for long: what is absent there is no mistake of recording.
         result[role] = _in_order(stream if role in ROWS else _with_values(stream))
     return result
@@ -174,8 +174,8 @@ def _with_values(stream: _Stream) -> _Stream:
     text = f"{stream.name}: {np.sum(absent)} of {len(absent)} messages have no value (no fix)."
     left_out = Finding("missing_samples", f"{text} They are left out.", Verdict.TRUSTWORTHY)
     there = stream.time_ns[~absent], stream.values[~absent]
-    noticed = (*stream.noticed, *[left_out] * bool(absent.any()))
-    return _Stream(stream.name, stream.place, *there, noticed)
+    findings = (*stream.findings, *[left_out] * bool(absent.any()))
+    return _Stream(stream.name, stream.place, *there, findings)
 
 
 def _of_sensor(reader: AnyReader, path: Path, sensor: AidingSensor) -> Wanted | None:
@@ -246,7 +246,7 @@ def _in_order(stream: _Stream) -> _Stream:
     # What is infinite is no measurement either.
     values = np.where(np.abs(stream.values) < LARGEST_NUMBER, stream.values, np.nan)
     stray = all_strays(stream.time_ns)
-    noticed = stream.noticed + stray_finding(stream.name, stream.time_ns[stray])
+    findings = stream.findings + stray_finding(stream.name, stream.time_ns[stray])
     time_ns, values = stream.time_ns[~stray], values[~stray]
     step = clock_set_back(time_ns, values)
     if step is not None:
@@ -256,9 +256,11 @@ def _in_order(stream: _Stream) -> _Stream:
     time_ns, values = time_ns[order], values[order]
     separate = separate_stamps(time_ns, values)
     if separate is not None:
-        noticed += (batches_finding(stream.name, time_ns),)
+        findings += (batches_finding(stream.name, time_ns),)
         time_ns = separate
-    return _Stream(stream.name, stream.place, time_ns, values, noticed, int(np.argmin(stray)), step)
+    return _Stream(
+        stream.name, stream.place, time_ns, values, findings, int(np.argmin(stray)), step
+    )
 
 
 def _refuse_steps(streams: Collection[_Stream], span: Span) -> None:
@@ -282,7 +284,7 @@ def _refuse_steps(streams: Collection[_Stream], span: Span) -> None:
 
 def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
     """Return the messages that have a sample, and report the others."""
-    declared += stream.noticed
+    declared += stream.findings
     jumps = np.diff(stream.time_ns) > LONGEST_GAP / NANOSECOND
     if jumps.any():
         raise InputError(

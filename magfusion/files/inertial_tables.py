@@ -46,10 +46,10 @@ def read_imu(
     table = read_table(path, IMU_LAYOUT, span, content)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
-    time, values, noticed = measured_rows(table, (*_GYRO, *_ACCEL), "IMU", spread=True)
+    time, values, findings = measured_rows(table, (*_GYRO, *_ACCEL), "IMU", spread=True)
     imu = ImuSamples(time, values[:, :3].copy(), values[:, 3:].copy())
     check_imu(imu, str(path))
-    return imu, noticed
+    return imu, findings
 
 
 def write_imu(imu: ImuSamples, path: Path, epoch_ns: int) -> None:
@@ -75,14 +75,14 @@ def read_waveform(
         return None, ()
     columns = tuple(name for name in FIELD if table.has((name,)))
     alone = content is not None or {TIME, *FIELD}.issuperset(column_names(path))
-    time, values, noticed = measured_rows(table, columns, "magnetometer", alone)
+    time, values, findings = measured_rows(table, columns, "magnetometer", alone)
     check_field(np.linalg.norm(values, axis=1), str(path))
     if columns == FIELD:
-        return Waveform(time, values), noticed
+        return Waveform(time, values), findings
     whole = np.zeros((len(time), 3))
     whole[:, [FIELD.index(name) for name in columns]] = values
     axes = "".join(name[-1] for name in columns)
-    return Waveform(time, whole, axes=axes), noticed
+    return Waveform(time, whole, axes=axes), findings
 
 
 def measured_rows(
@@ -95,9 +95,9 @@ def measured_rows(
     """
     values = table.numbers(names, nan=True)
     separate = separate_stamps(table.time_ns, values) if spread else None
-    noticed = stray_finding(stream, [stamp for _, stamp in table.stray])
+    findings = stray_finding(stream, [stamp for _, stamp in table.stray])
     if separate is not None:
-        noticed += (batches_finding(stream, table.time_ns),)
+        findings += (batches_finding(stream, table.time_ns),)
         time = table.time + (separate - table.time_ns) * NANOSECOND
         table = replace(table, time_ns=separate, time=time)
     lost_epochs = LostRows.of(table.time_ns, values)
@@ -109,8 +109,8 @@ def measured_rows(
     if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
         table.refuse(lost_epochs.absent, name, np.full(len(table), np.nan), "write a finite number")
-    noticed += lost_epochs.findings(stream)
-    return table.time[lost_epochs.kept], values[lost_epochs.kept], noticed
+    findings += lost_epochs.findings(stream)
+    return table.time[lost_epochs.kept], values[lost_epochs.kept], findings
 
 
 def write_waveform(

@@ -106,7 +106,7 @@ def read_log(
     if marks is not None:
         waveforms = {name: replace(wave, marks=marks) for name, wave in waveforms.items()}
     of_truth: list[Finding] = []
-    read_truth = partial(_read_truth, noticed=of_truth)
+    read_truth = partial(_read_truth, findings=of_truth)
     truth = read_if_there(tables["truth"], read_truth, span)
     log = Log(
         name=header.name,
@@ -116,7 +116,7 @@ def read_log(
         waveform=waveform,
         fields=read_if_there(tables["fields"], read_fields, span),
         truth=truth,
-        noticed=(*of_imu, *of_waveform, *of_truth, *lost_finding(header.audio)),
+        findings=(*of_imu, *of_waveform, *of_truth, *lost_finding(header.audio)),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
         reference=read_waveform(tables["reference"], span)[0],
@@ -184,5 +184,5 @@ def _keep_others(former: Path, directory: Path) -> None:
             shutil.copy2(entry, directory / entry.name)
 
 
-def _read_truth(path: Path, span: Span, noticed: list[Finding]) -> Trajectory:
-    return read_trajectory(path, span.epoch_ns, span.start, span.end, noticed=noticed)
+def _read_truth(path: Path, span: Span, findings: list[Finding]) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end, findings=findings)

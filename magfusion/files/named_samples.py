@@ -46,7 +46,7 @@ def read_waveforms(
     table = read_table(path, _LAYOUT, span)
     names, of = table.texts(MAGNETOMETER)
     result: dict[str, Waveform] = {}
-    noticed = [*stray_finding(MAGNETOMETER, [stamp for _, stamp in table.stray])]
+    findings = [*stray_finding(MAGNETOMETER, [stamp for _, stamp in table.stray])]
     for k, name in enumerate(names):
         own = np.flatnonzero(of == k)
         if not len(own):
@@ -64,8 +64,8 @@ def read_waveforms(
         time, values, lost_epochs = measured_rows(mine, FIELD, f"{MAGNETOMETER} {name}")
         check_field(np.linalg.norm(values, axis=1), str(place))
         result[name] = Waveform(time, values)
-        noticed += lost_epochs
-    return result, tuple(noticed)
+        findings += lost_epochs
+    return result, tuple(findings)
 
 
 def write_waveforms(waveforms: Mapping[str, Waveform], path: Path, epoch_ns: int) -> None:

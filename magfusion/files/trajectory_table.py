@@ -81,19 +81,19 @@ def read_trajectory(
     start: float | None = None,
     end: float | None = None,
     content: pa.Table | None = None,
-    noticed: list[Finding] | None = None,
+    findings: list[Finding] | None = None,
 ) -> Trajectory:
     """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
 
     A truth may have positions alone or attitudes alone; the other part is NaN then.
 
-    ``content`` as in `read_table`. `noticed`: receives the number of rows without a pose, or that
+    ``content`` as in `read_table`. `findings`: receives the number of rows without a pose, or that
     are copies of others, which are left out; without it they are refused.
     """
-    layout = _LAYOUT._replace(repeats=noticed is not None)
+    layout = _LAYOUT._replace(repeats=findings is not None)
     table = read_table(path, layout, Span(epoch_ns, start, end), content)
-    if noticed is not None:
-        table = _with_poses(_without_copies(table, noticed), noticed)
+    if findings is not None:
+        table = _with_poses(_without_copies(table, findings), findings)
     rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)
     if table.has(QUATERNION):
         rotation = unit_rotation(table).as_matrix()
@@ -109,7 +109,7 @@ def read_trajectory(
     )
 
 
-def _without_copies(table: Table, noticed: list[Finding]) -> Table:
+def _without_copies(table: Table, findings: list[Finding]) -> Table:
     """Return a table without rows that were written twice; refuse others of one time."""
     names = [name for name in table.data.column_names if name != TIME]
     copies = copied_rows(table.time_ns, table.numbers(names, nan=True))
@@ -117,7 +117,7 @@ def _without_copies(table: Table, noticed: list[Finding]) -> Table:
     table.refuse(twice, TIME, table.time_ns, TWICE)
     if not copies.any():
         return table
-    noticed += copies_findings([copies_text(str(table.path), copies)])
+    findings += copies_findings([copies_text(str(table.path), copies)])
     once = ~copies
     data = table.data.filter(pa.array(once))
     return replace(table, data=data, time_ns=table.time_ns[once], time=table.time[once])
@@ -132,13 +132,13 @@ def unit_rotation(table: Table) -> Rotation:
     return Rotation.from_quat(quaternion, scalar_first=True)
 
 
-def _with_poses(table: Table, noticed: list[Finding]) -> Table:
+def _with_poses(table: Table, findings: list[Finding]) -> Table:
     """Return the rows of a table that have a pose, with quaternions of unit length."""
     names = _POSITION if table.has(_POSITION) else ()
     quaternion = table.numbers(QUATERNION, nan=True) if table.has(QUATERNION) else None
     poses = PoseRows.of(table.numbers(names, nan=True), quaternion)
     table.refuse(poses.refused, "qw to qz", poses.length, _UNIT_LENGTH)
-    noticed += poses.findings("truth" if table.path.stem in ("truth", "data") else table.path.name)
+    findings += poses.findings("truth" if table.path.stem in ("truth", "data") else table.path.name)
     data = table.data
     quaternions = () if poses.quaternion is None else poses.quaternion.T
     for name, values in zip(QUATERNION, quaternions, strict=False):

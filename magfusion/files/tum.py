@@ -41,12 +41,12 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
             stream.write(" ".join([time, *(f"{value:.9f}" for value in pose)]) + "\n")
 
 
-def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None) -> Trajectory:
+def read_tum(path: Path, epoch_ns: int = 0, findings: list[Finding] | None = None) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
     Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
     not text, empty, a line does not hold eight numbers (or four, of positions alone: as many as the
-    first line), no line or too few a pose, or the times do not increase. `noticed`: receives the
+    first line), no line or too few a pose, or the times do not increase. `findings`: receives the
     number of lines without a pose, or that were written twice, which are left out; without it they
     are refused.
     """
@@ -55,8 +55,8 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     numbers = np.array([_numbers(path, number, text, count) for number, text in lines])
     values, unit = numbers[:, 1:], tum_time_unit(np.max(np.abs(numbers[:, 0])))
     stamps = np.array([_stamp(path, number, text, unit) for number, text in lines], dtype=np.int64)
-    if noticed is not None and (copies := copied_rows(stamps, values)).any():
-        noticed += copies_findings([copies_text(str(path), copies)])
+    if findings is not None and (copies := copied_rows(stamps, values)).any():
+        findings += copies_findings([copies_text(str(path), copies)])
         lines = [line for line, copy in zip(lines, copies, strict=True) if not copy]
         values, stamps = values[~copies], stamps[~copies]
     time = Span(epoch_ns).seconds(stamps)
@@ -66,15 +66,15 @@ def read_tum(path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
     for k in np.flatnonzero(poses.refused)[:1]:
         result = f"a quaternion of length {poses.length[k]:.6g}"
         _refuse(path, lines[k][0], result, "one of length 1")
-    for k in np.flatnonzero(~poses.kept & (noticed is None))[:1]:
+    for k in np.flatnonzero(~poses.kept & (findings is None))[:1]:
         _refuse(path, lines[k][0], repr(lines[k][1][:60]), "a pose")
     if not poses.kept.any():
         raise InputError(f"{path}: none of its {len(lines)} lines has a pose; record it again.")
-    if noticed is not None:
+    if findings is not None:
         if unit != "s":
             text = f"{path.name}: its times are read as {unit}; in s they are no dates."
-            noticed.append(Finding("stamp_resolution", text, Verdict.TRUSTWORTHY))
-        noticed += poses.findings(path.name)
+            findings.append(Finding("stamp_resolution", text, Verdict.TRUSTWORTHY))
+        findings += poses.findings(path.name)
     time, position = time[poses.kept], values[poses.kept, :3]
     if poses.quaternion is None:
         return Trajectory(time, np.full((len(time), 3, 3), np.nan), position)

@@ -64,7 +64,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         if log.waveforms:
             separate = demodulated_apart(log, site, lockin)
             assert separate.log.fields is not None
-            log = replace(separate.log, noticed=(*log.noticed, *separate.noticed))
+            log = replace(separate.log, findings=(*log.findings, *separate.findings))
             samples, dropped = by_own_clocks(separate.log.fields, site), separate.dropped
         elif rested is None:
             samples, dropped = phasors(log, site, lockin)
@@ -123,7 +123,7 @@ def _of(samples: FieldSamples, channel: int, joint: str) -> str:
 def _without_temperature(log: Log, site: Site) -> Site:
     """Return the site of phasors in which the magnetometer's temperature is compensated."""
     magnetometer = site.platform.magnetometer
-    missing = any(finding.code == "temperature_missing" for finding in log.noticed)
+    missing = any(finding.code == "temperature_missing" for finding in log.findings)
     if magnetometer.temperature_model is None or missing:
         return site
     at_reference = replace(magnetometer, temperature_model=None)

@@ -59,9 +59,9 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.results.report import error_figures
     from magfusion.results.truth_frame import frame_remarks, unit_text
 
-    noticed: list[Finding] = []
-    true, epoch_ns, remarks = _read_truth(settings, noticed)
-    result = _read_estimate(settings, epoch_ns, noticed)
+    findings: list[Finding] = []
+    true, epoch_ns, remarks = _read_truth(settings, findings)
+    result = _read_estimate(settings, epoch_ns, findings)
     with named(f"{settings.estimate} against {settings.truth}"):
         result, aligned = _aligned(settings, result, true)
         pairs = associate(result, true)
@@ -71,19 +71,21 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
             raise InputError(unit)
         errors = error_figures(trajectory_errors(result, true))
         frames = [*remarks, unit] if unit else frame_remarks(pairs, remarks)
-    remarks = [*(finding.text for finding in noticed), *frames]
+    remarks = [*(finding.text for finding in findings), *frames]
     notes = Figures(*[Figure("notes", remarks, section=Section.NOTES)] * bool(remarks))
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | aligned | notes
 
 
-def _read_estimate(settings: EvaluateSettings, epoch_ns: int, noticed: list[Finding]) -> Trajectory:
+def _read_estimate(
+    settings: EvaluateSettings, epoch_ns: int, findings: list[Finding]
+) -> Trajectory:
     """Return the poses of the frame that the truth tracks."""
     from magfusion.jobs.inputs import read_any_poses
     from magfusion.results.alignment import tracked_point
 
     lever = numbers("--lever-arm", settings.lever_arm, (3,))
     mounting = numbers("--mounting", settings.mounting, (3,))
-    estimate = read_any_poses(settings.estimate, epoch_ns, noticed)
+    estimate = read_any_poses(settings.estimate, epoch_ns, findings)
     if not any((*lever, *mounting)):
         return estimate
     if not estimate.has_attitude:
@@ -116,7 +118,7 @@ def _aligned(
 
 
 def _read_truth(
-    settings: EvaluateSettings, noticed: list[Finding]
+    settings: EvaluateSettings, findings: list[Finding]
 ) -> tuple[Trajectory, int, list[str]]:
     """Return the truth, the zero of its clock (ns), and what contradicts it in its log."""
     from magfusion.estimation.data_checks.truth import truth_findings
@@ -127,15 +129,15 @@ def _read_truth(
     is_result = (path / "trajectory.parquet").is_file()
     ned = settings.truth_axes == "ned"
     if is_result or not (path.is_dir() or is_bag(path)):
-        poses = read_any_poses(path, noticed=noticed)
+        poses = read_any_poses(path, findings=findings)
         return from_ned(poses) if ned else poses, 0, []
     log = open_log(path, topics=topics)
     if log.truth is None:
         raise InputError(f"{path}: has no truth; give a log with truth, a TUM file or a table")
     poses = from_ned(log.truth) if ned else log.truth
-    noticed += [one for one in log.noticed if "truth" in one.text.partition(": ")[0]]
-    findings = truth_findings(replace(log, truth=poses))
-    return poses, log.epoch_ns, [finding.text for finding in findings]
+    findings += [one for one in log.findings if "truth" in one.text.partition(": ")[0]]
+    contradictions = truth_findings(replace(log, truth=poses))
+    return poses, log.epoch_ns, [one.text for one in contradictions]
 
 
 COMMAND = Command(EvaluateSettings, run_evaluate, example="magfusion evaluate run log")

@@ -166,8 +166,8 @@ def read_job(
     if log.waveforms and not raw:
         with named(job.log_path):
             result = demodulated_apart(log, site, lockin, repeated=reread)
-        noticed = (*log.noticed, *result.noticed)
-        log, site = without_silent(replace(result.log, noticed=noticed), site)
+        findings = (*log.findings, *result.findings)
+        log, site = without_silent(replace(result.log, findings=findings), site)
     elif log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=along_axis(order_channels(log.fields, site), site))
@@ -177,7 +177,7 @@ def read_job(
             log = turning_currents(log, site)
         log, site = with_drives(log, site)
     if log.reference is not None and not reference:
-        log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))
+        log = replace(log, reference=None, findings=(*log.findings, NOT_USED))
     log, site = at_reference(log, site)
     if not select_beacons:
         return log, site
@@ -277,11 +277,11 @@ def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
 
 
 def read_any_poses(
-    path: Path, epoch_ns: int = 0, noticed: list[Finding] | None = None
+    path: Path, epoch_ns: int = 0, findings: list[Finding] | None = None
 ) -> Trajectory:
     """Read a trajectory as `read_estimate`, which may have positions or attitudes alone.
 
-    `noticed`: receives the number of rows without a pose, which are left out; without it they are
+    `findings`: receives the number of rows without a pose, which are left out; without it they are
     refused.
     """
     if path.is_dir():
@@ -293,6 +293,6 @@ def read_any_poses(
         if names and TIME not in names:
             from magfusion.files.foreign.euroc import read_euroc_poses  # slow, and seldom needed
 
-            return read_euroc_poses(path, epoch_ns, noticed)
-        return read_trajectory(path, epoch_ns, noticed=noticed)
-    return read_tum(path, epoch_ns, noticed)
+            return read_euroc_poses(path, epoch_ns, findings)
+        return read_trajectory(path, epoch_ns, findings=findings)
+    return read_tum(path, epoch_ns, findings)

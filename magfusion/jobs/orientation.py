@@ -61,7 +61,7 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
     open_heading = np.array([s.cov[2, 2] for s in result.states])
     usual = result.states[int(np.argsort(open_heading)[len(open_heading) // 2])]
     findings += doubts(usual.cov[:3, :3], np.eye(3))
-    trust = Trust((*log.noticed, *uneven_stamps(log, site), *findings))
+    trust = Trust((*log.findings, *uneven_stamps(log, site), *findings))
     figures = heading(name, log.name) | trust_figures(trust) | _figures(result, states, elapsed)
     figures |= _errors(states, log)
     by_state = uniform_trust(len(states), trust.verdict)

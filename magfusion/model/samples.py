@@ -276,7 +276,7 @@ class Log:
 
     ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
     ``steady`` has the times of ``fields`` and is not stored in a file.  ``clocks`` lists streams
-    with scattered stamps, ``noticed`` other repairs.  If not ``inertial``, the samples of the IMU
+    with scattered stamps, ``findings`` other repairs.  If not ``inertial``, the samples of the IMU
     are those of a motion prior (`magfusion.model.without_imu`), not measurements.
     ``temperatures`` are those for which the samples are not corrected yet.  ``drive`` has the
     recorded currents of coils, ``reference`` the samples of a remote second magnetometer by its own
@@ -299,7 +299,7 @@ class Log:
     truth: Trajectory | None = None
     steady: SteadyFields | None = None
     clocks: Mapping[str, StreamClock] = field(default_factory=dict)
-    noticed: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     inertial: bool = True
     temperatures: Temperatures | None = None
     drive: DriveSamples | None = None

@@ -51,7 +51,7 @@ def banner_text(verdict: str, lines: list[str]) -> str:
 def log_verdict(recording: rr.RecordingStream, trust: Trust, summary: str) -> tuple[str, str]:
     """Write the verdict, its reasons, and unverified parameters; return entity and text."""
     lines = [f"- {summary}", *(f"- **{reason.text}**" for reason in trust.reasons)]
-    lines += [f"- *noticed:* {remark.text}" for remark in trust.remarks]
+    lines += [f"- *findings:* {remark.text}" for remark in trust.remarks]
     if trust.unverified:
         names = ", ".join(one.name for one in trust.unverified)
         lines.append(f"- *fixed, not observable in this log:* {names}")

@@ -29,7 +29,7 @@ from magfusion.units import IntArray
 def clean_log(log: Log, site: Site) -> Log:
     """Return a log with single wrong stamps and samples corrected.
 
-    Its ``clocks`` and ``noticed`` report the corrections. Raises InputError where most samples of
+    Its ``clocks`` and ``findings`` report the corrections. Raises InputError where most samples of
     an instrument are beyond its declared range.
     """
     log = _without_freeze(on_even_clocks(_within_range(log, site), site), site)
@@ -37,15 +37,15 @@ def clean_log(log: Log, site: Site) -> Log:
     result = {stream.name: false_rows(stream, site) for stream in streams(log)}
     if not any(len(rows) for rows in result.values()):
         return log
-    noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
-    noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
-    return replace(_without(log, result), noticed=(*log.noticed, *noticed))
+    findings = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
+    findings = [replace(f, text=f"{f.text} They are left out.") for f in findings]
+    return replace(_without(log, result), findings=(*log.findings, *findings))
 
 
 def _within_range(log: Log, site: Site) -> Log:
     """Return a log without samples beyond the declared range of their instrument."""
     result: dict[str, IntArray] = {}
-    noticed: list[Finding] = []
+    findings: list[Finding] = []
     for stream in streams(log):
         largest = declared_range(stream.name, site.platform)
         rows = np.flatnonzero(exceeds(stream.value, largest))
@@ -57,10 +57,10 @@ def _within_range(log: Log, site: Site) -> Log:
             raise InputError(f"{text}, of {len(stream.value)}; correct {key}, or the samples' unit")
         result[stream.name] = rows
         text = f"{text}. They are left out."
-        noticed.append(Finding("missing_samples", text, Verdict.TRUSTWORTHY))
+        findings.append(Finding("missing_samples", text, Verdict.TRUSTWORTHY))
     if not result:
         return log
-    return replace(_without(log, result), noticed=(*log.noticed, *noticed))
+    return replace(_without(log, result), findings=(*log.findings, *findings))
 
 
 def _without(log: Log, result: dict[str, IntArray]) -> Log:
@@ -92,9 +92,9 @@ def _without_pauses(log: Log, site: Site) -> Log:
     rows = [pause_rows(s) for s in streams(log) if s.name == "magnetometer"]
     if not any(map(len, rows)):
         return log
-    noticed = next(f for f in repeated_samples(log, site) if f.text.startswith("magnetometer"))
-    noticed = replace(noticed, text=f"{noticed.text} They are left out.")
-    return replace(_without(log, {"magnetometer": rows[0]}), noticed=(*log.noticed, noticed))
+    findings = next(f for f in repeated_samples(log, site) if f.text.startswith("magnetometer"))
+    findings = replace(findings, text=f"{findings.text} They are left out.")
+    return replace(_without(log, {"magnetometer": rows[0]}), findings=(*log.findings, findings))
 
 
 def _without_freeze(log: Log, site: Site) -> Log:
@@ -103,7 +103,7 @@ def _without_freeze(log: Log, site: Site) -> Log:
     rows = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *hung]))
     if len(rows) == 0 or len(rows) >= len(log.imu) - 1:
         return log
-    noticed = [
+    findings = [
         replace(
             f,
             text=f"{f.text} Here it is left out; the magnetic fields bridge the gap.",
@@ -112,4 +112,4 @@ def _without_freeze(log: Log, site: Site) -> Log:
         for f in frozen_samples(log, site)
         if f.code == "frozen_imu"
     ]
-    return replace(_without_inertial(log, rows), noticed=(*log.noticed, *noticed))
+    return replace(_without_inertial(log, rows), findings=(*log.findings, *findings))

@@ -94,7 +94,7 @@ def recorded(
     compensated : Detected, optional
         Their reception by a solution, with the motion inside the windows compensated.
     """
-    result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
+    result = [*log.findings, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
     log = beginning(log)
     # Of an unknown mounting the field and the gyroscope cannot be compared.
     mounted = site is None or is_mounted(site)

@@ -56,7 +56,7 @@ def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSample
 def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     """Return a log without magnetometers that detect nothing where another does, and its site.
 
-    The log's ``noticed`` lists them.
+    The log's ``findings`` lists them.
     """
     if not site.platform.further or log.fields is None:
         return log, site
@@ -65,7 +65,7 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     silent = [k for k, n in there.items() if n == 0 or n >= MIN_EPOCHS]
     if not silent or len(silent) == len(sensors):
         return log, site
-    noticed = [
+    findings = [
         Finding(
             "magnetometer_silent",
             f"Magnetometer {sensors[k].name} detects no beacon in {there[k]} epochs in which others"
@@ -75,7 +75,7 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     ]
     kept = [k for k in range(len(sensors)) if k not in silent]
     log, site = _only(log, site, kept)
-    return replace(log, noticed=(*log.noticed, *noticed)), site
+    return replace(log, findings=(*log.findings, *findings)), site
 
 
 def _silent_epochs(fields: FieldSamples, site: Site) -> dict[int, int]:

@@ -119,7 +119,7 @@ def timings(log: Log, site: Site | None = None) -> tuple[Timing, ...]:
 def uneven_stamps(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the defects of a log's time stamps."""
     result = timings(log, site)
-    paused = any(f.code == "repeated_samples" for f in log.noticed)
+    paused = any(f.code == "repeated_samples" for f in log.findings)
     for one in result:
         explained = {"samples_lost"} if paused and one.stream == "magnetometer" else set()
         clock = log.clocks.get(one.stream)

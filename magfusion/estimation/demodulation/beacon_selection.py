@@ -48,7 +48,7 @@ def select_detected(
         " not estimated: they remain as declared."
     )
     findings = Finding("beacons_unheard", text, Verdict.TRUSTWORTHY, 0.0)
-    log = replace(log, fields=fields, noticed=(*log.noticed, findings))
+    log = replace(log, fields=fields, findings=(*log.findings, findings))
     return log, _with_beacons(site, detected)
 
 

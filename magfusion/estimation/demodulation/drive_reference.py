@@ -68,8 +68,8 @@ def with_drives(log: Log, site: Site) -> tuple[Log, Site]:
         samples = samples if even is None else DriveSamples(even.time, samples.current)
     receiver = DriveReceiver(site, DriveShares())
     receiver.push(samples)
-    noticed = (*log.noticed, *drive_findings(receiver, site))
-    return replace(log, noticed=noticed), replace(site, drives=receiver.shares)
+    findings = (*log.findings, *drive_findings(receiver, site))
+    return replace(log, findings=findings), replace(site, drives=receiver.shares)
 
 
 def drive_findings(receiver: DriveReceiver, site: Site) -> Iterator[Finding]:

@@ -27,7 +27,7 @@ class SeparateDemodulation(NamedTuple):
     log: Log
     dropped: Mapping[str, int]  # reason, with the magnetometer's name, to number of windows
     # corrections to the samples of each, and how they were demodulated
-    noticed: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def of_site(log: Log, site: Site) -> Log:
@@ -65,7 +65,7 @@ def each_alone(log: Log, site: Site) -> Iterator[tuple[str, Log, Site]]:
             wave.time + sensor.clock_offset, wave.measured_sensor, wave.marks, wave.axes
         )
         alone = site.platform.with_magnetometers((replace(sensor, clock_offset=0.0),))
-        own = replace(log, waveform=here, waveforms={}, fields=None, noticed=())
+        own = replace(log, waveform=here, waveforms={}, fields=None, findings=())
         yield sensor.name, own, replace(site, platform=alone)
 
 
@@ -76,7 +76,7 @@ def each_recorded(log: Log, site: Site | None) -> Iterator[tuple[str, Log, Site 
     """
     if site is not None:
         for name, own, alone in each_alone(log, site):
-            yield name, clean_log(replace(own, noticed=log.noticed), alone), alone
+            yield name, clean_log(replace(own, findings=log.findings), alone), alone
         return
     for name, wave in log.waveforms.items():
         yield name, replace(log, waveform=wave, waveforms={}), None
@@ -96,14 +96,14 @@ def demodulated_apart(
         lockin = replace(usual_lockin(site) if lockin is None else lockin, origin=0.0)
     parts: dict[str, FieldSamples] = {}
     dropped: dict[str, int] = {}
-    findings: dict[str, tuple[Finding, ...]] = {}
+    by_sensor: dict[str, tuple[Finding, ...]] = {}
     imu, waves = log.imu, dict[str, Waveform]()
     late = {sensor.name: sensor.clock_offset for sensor in site.platform.magnetometers}
     for name, one, alone in each_alone(log, site):
         one = clean_log(one, alone)
         assert one.waveform is not None
         waves[name] = replace(one.waveform, time=one.waveform.time - late[name])
-        imu, findings[name] = one.imu, passed_on(one, alone).findings
+        imu, by_sensor[name] = one.imu, passed_on(one, alone).findings
         try:
             samples, lost_epochs = phasors(one, alone, lockin)
         except InputError as error:
@@ -114,9 +114,9 @@ def demodulated_apart(
     names = [sensor.name for sensor in site.platform.magnetometers]
     fields = side_by_side([parts.get(name, FieldSamples.empty(own)) for name in names], site)
     missing = [name for name in names if name not in parts]
-    noticed = (*by_name(findings), *_how(list(parts), missing, repeated=repeated))
+    findings = (*by_name(by_sensor), *_how(list(parts), missing, repeated=repeated))
     log = replace(log, imu=imu, waveforms=waves if repeated else {}, fields=fields)
-    return SeparateDemodulation(log, dropped, noticed)
+    return SeparateDemodulation(log, dropped, findings)
 
 
 def by_name(demodulated: Mapping[str, tuple[Finding, ...]]) -> Iterator[Finding]:

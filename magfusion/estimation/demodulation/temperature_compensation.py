@@ -27,7 +27,7 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
     """
     refuse_warm(site)
     known = Temperatures() if log.temperatures is None else log.temperatures
-    log = replace(log, noticed=(*log.noticed, *_missing(known, site)))
+    log = replace(log, findings=(*log.findings, *_missing(known, site)))
     site = replace(site, temperatures=known)
     if MAGNETOMETER not in known.readings or site.platform.magnetometer.temperature_model is None:
         return log, site

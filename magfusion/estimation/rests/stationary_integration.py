@@ -59,9 +59,9 @@ class IntegratedRests:
 
     def log(self, log: Log) -> Log:
         """Return the log with these epochs in place of its waveform."""
-        noticed = (*log.noticed, *self.findings)
+        findings = (*log.findings, *self.findings)
         return replace(
-            log, waveform=None, fields=self.fields, drive=None, reference=None, noticed=noticed
+            log, waveform=None, fields=self.fields, drive=None, reference=None, findings=findings
         )
 
     def amplitude(self) -> Array:

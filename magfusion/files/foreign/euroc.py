@@ -49,7 +49,7 @@ _BIASES = {
 class _StreamTable(NamedTuple):
     path: Path
     content: pa.Table
-    noticed: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
 
 
 def is_euroc(path: Path) -> bool:
@@ -77,22 +77,22 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     waveform, of_waveform = (
         (None, ()) if field is None else read_waveform(field.path, span, field.content)
     )
-    noticed = [finding for table in tables.values() for finding in table.noticed]
+    findings = [finding for table in tables.values() for finding in table.findings]
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
         imu=samples,
         waveform=waveform,
-        truth=_truth(tables.get("truth"), span, noticed),
-        noticed=(*noticed, *of_imu, *of_waveform),
+        truth=_truth(tables.get("truth"), span, findings),
+        findings=(*findings, *of_imu, *of_waveform),
     )
 
 
-def read_euroc_poses(path: Path, epoch_ns: int, noticed: list[Finding] | None) -> Trajectory:
+def read_euroc_poses(path: Path, epoch_ns: int, findings: list[Finding] | None) -> Trajectory:
     """Read a table of poses whose head names them as EuRoC's ground truth does.
 
-    `noticed` as of `read_trajectory`. Raises InputError where the head names no whole poses.
+    `findings` as of `read_trajectory`. Raises InputError where the head names no whole poses.
     """
     source = array_source(path) if path.suffix == ".parquet" else text_source(path)
     named = named_columns(source.columns, "truth")
@@ -104,9 +104,9 @@ def read_euroc_poses(path: Path, epoch_ns: int, noticed: list[Finding] | None) -
             f" it by magfusion import --truth {path}."
         )
     table = _read("truth", path)
-    if noticed is not None:
-        noticed += table.noticed
-    return read_trajectory(path, epoch_ns, content=table.content, noticed=noticed)
+    if findings is not None:
+        findings += table.findings
+    return read_trajectory(path, epoch_ns, content=table.content, findings=findings)
 
 
 def euroc_tables(path: Path) -> dict[str, Path]:
@@ -179,10 +179,10 @@ def _read(stream: str, path: Path) -> _StreamTable:
         time_ns = pa.array(stamps, mask=stamps == NO_STAMP)
         parts.append(pa.table({TIME_NS: time_ns, **dict(zip(names, values.T, strict=True))}))
         left_out += sum(part.left_out.values())
-    noticed = [_cut_rows(stream, left_out)] if left_out else []
+    findings = [_cut_rows(stream, left_out)] if left_out else []
     (term,) = plan.terms[TIME]
     return _StreamTable(
-        path, pa.concat_tables(parts), (*noticed, *_resolution(stream, source, term))
+        path, pa.concat_tables(parts), (*findings, *_resolution(stream, source, term))
     )
 
 
@@ -211,8 +211,10 @@ def _first_sample(table: _StreamTable) -> int:
     return counted_back(stamps[~stray], int(np.argmin(stray)))
 
 
-def _truth(table: _StreamTable | None, span: Span, noticed: list[Finding]) -> Trajectory | None:
+def _truth(table: _StreamTable | None, span: Span, findings: list[Finding]) -> Trajectory | None:
     if table is None:
         return None
-    truth = read_trajectory(table.path, span.epoch_ns, span.start, span.end, table.content, noticed)
+    truth = read_trajectory(
+        table.path, span.epoch_ns, span.start, span.end, table.content, findings
+    )
     return truth if len(truth) else None
