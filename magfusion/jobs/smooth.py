@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.outer_iterations import PassFile
     from magfusion.jobs.inputs import Job
-    from magfusion.jobs.smooth_failure import Failure
     from magfusion.jobs.smooth_result import Finished
 
 
@@ -207,9 +207,7 @@ def run_smooth(
     from magfusion.jobs.inputs import named
     from magfusion.jobs.result_directory import claim, refuse_failed
     from magfusion.jobs.smooth_correction import corrected
-    from magfusion.jobs.smooth_failure import Failure, save_failure
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
-    from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
     recording, site = _read(job, settings, by_rests=rest is not None, report=report)
@@ -232,13 +230,7 @@ def run_smooth(
                 result, placed = smooth_and_place(log, site, settings, report)
             log, site, result, findings = agreed_smoothed(result, log, site, settings, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
-        estimate = _without_result(job, log, site, settings, risk, error, report)
-        if isinstance(estimate, Failure):
-            with claimed as whole:
-                save_failure(whole, estimate, log, site)
-            saved = f"the single-epoch fixes are saved in {job.output / FAILED}"
-            raise EstimationError(f"{job.log_path}: {estimate.reason}; {saved}") from error
-        done, placed = estimate, ()
+        done, placed = _without_result(job, log, site, settings, risk, error, report, claimed), ()
     else:
         give_back_memory()
         findings += () if rested is None else beyond(recording, log, site)
@@ -265,14 +257,17 @@ def _without_result(
     risk: Risk | None,
     error: RuntimeError,
     report: Report,
-) -> Finished | Failure:
+    claimed: AbstractContextManager[Path],
+) -> Finished:
     """Return the result with a corrected site where there is none with the declared one.
 
-    Otherwise the reason, with the single-epoch fixes.
+    Raises EstimationError with the reason if there is none, and saves the single-epoch fixes in the
+    directory that is claimed.
     """
     from magfusion.estimation.integrity.correction import corrections
     from magfusion.jobs.smooth_correction import corrected
-    from magfusion.jobs.smooth_failure import failure_of
+    from magfusion.jobs.smooth_failure import failure_of, save_failure
+    from magfusion.results.report import FAILED
 
     reason = reason_of(error)
     if _has_unknown(site):
@@ -280,7 +275,13 @@ def _without_result(
     failure = failure_of(log, site, settings, reason)
     possible = corrections(site, (), (), failure.cause)
     reasons = failure.trust.reasons
-    return corrected(log, site, settings, risk, possible, reasons, report=report) or failure
+    done = corrected(log, site, settings, risk, possible, reasons, report=report)
+    if done is not None:
+        return done
+    with claimed as directory:
+        save_failure(directory, failure, log, site)
+    saved = f"the single-epoch fixes are saved in {job.output / FAILED}"
+    raise EstimationError(f"{job.log_path}: {failure.reason}; {saved}") from error
 
 
 def _has_unknown(site: Site) -> bool:

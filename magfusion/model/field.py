@@ -182,10 +182,6 @@ def observe(
     # (..., tones, coils, 3)
     driven = seen.coils_beacon if seen.mapped is None else seen.coils_beacon - seen.mapped.added
     by_coil = driven[..., None, :, :] * seen.tones_from_coils[..., None]
-    by_time_offset: ComplexArray | None = None
-    if twist_body is not None:
-        twist = twist_body.astype(np.complex128)[..., None, :, None]
-        by_time_offset = -(platform_pose @ twist)[..., 0]
     return Observation(
         phasor_sensor=phasor,
         platform_pose=platform_pose,
@@ -194,7 +190,7 @@ def observe(
         phase=1j * phasor,
         matrix=by_matrix(in_sensor),
         body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
-        time_offset=by_time_offset,
+        time_offset=None if twist_body is None else _by_time_offset(platform_pose, twist_body),
         log_conductivity=_by_log_conductivity(_source(beacon), seen, sensor_from_body),
     )
 
@@ -224,6 +220,12 @@ class _Seen(NamedTuple):
     tones_from_coils: ComplexArray  # (..., tones, coils)
     body_from_beacon: Array
     mapped: _Mapped | None
+
+
+def _by_time_offset(platform_pose: ComplexArray, twist_body: Array) -> ComplexArray:
+    """Return the derivative by the time offset: minus that by time, along the twist."""
+    twist = twist_body.astype(np.complex128)[..., None, :, None]
+    return np.asarray(-(platform_pose @ twist)[..., 0])
 
 
 def _by_log_conductivity(

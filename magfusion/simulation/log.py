@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.marks import Marks
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, RotorAngles, Waveform
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import MarkedSlots, Site
 from magfusion.model.trajectory import Trajectory, interpolated
@@ -124,18 +124,11 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         return simulate_waveform(motion, site, drives, rate_hz, duration, rng, *parts)
 
     several = bool(true_site.platform.further)
-    if several and turning and config.shafts.encoder:
-        raise InputError(
-            "encoder: the angle of a rotor cannot be recorded with several magnetometers; simulate"
-            " without an encoder, or with one magnetometer"
-        )
     waveform = None if several else recorded(among, magnetometer_rng, None)
     waveforms = _of_each(among, recorded, magnetometer_rng) if several else {}
     rotation = None
-    if waveform is not None and turning and config.shafts.encoder:
-        taken_at = waveform.time + true_site.platform.magnetometer.clock_offset
-        angles = recorded_angles(turning, taken_at, shaft_rng)
-        rotation = replace(angles, time=waveform.time)
+    if turning and config.shafts.encoder:
+        rotation = _encoder(waveform, true_site, turning, shaft_rng)
     reference = None
     if config.reference is not None:
         # Spawned last, so that earlier draws do not change.
@@ -158,6 +151,22 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         else {},
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def _encoder(
+    waveform: Waveform | None,
+    site: Site,
+    turning: dict[str, MagnetRotation],
+    rng: np.random.Generator,
+) -> RotorAngles:
+    """Return the angles of the rotors at the samples of the only magnetometer."""
+    if waveform is None:
+        raise InputError(
+            "encoder: the angle of a rotor cannot be recorded with several magnetometers; simulate"
+            " without an encoder, or with one magnetometer"
+        )
+    sampled_at = waveform.time + site.platform.magnetometer.clock_offset
+    return replace(recorded_angles(turning, sampled_at, rng), time=waveform.time)
 
 
 def _imu(

@@ -5,6 +5,7 @@ epochs and hypotheses at once.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -88,38 +89,22 @@ def fix_epochs(
     check_arguments(
         "fix_epochs", samples=(samples, FieldSamples), calibration=(calibration, Calibration)
     )
+    parts_of = partial(
+        epochs_of,
+        prior=prior,
+        survey_error=survey_error,
+        free_parameters=free_parameters,
+        gain_sigma=gain_sigma,
+    )
     if are_many(calibration.site) and prior is None and len(samples):
 
         def fixed(
             _rows: slice, some: FieldSamples, known: Calibration, up: Gravity | None
         ) -> Fixes:
-            return joined(
-                [
-                    _solve(epochs)
-                    for epochs in epochs_of(
-                        some,
-                        known,
-                        gravity=up,
-                        prior=None,
-                        survey_error=survey_error,
-                        free_parameters=free_parameters,
-                        gain_sigma=gain_sigma,
-                    )
-                ]
-            )
+            return joined([_solve(epochs) for epochs in parts_of(some, known, gravity=up)])
 
         return fix_parts(parts_detected(samples, calibration, gravity), calibration, fixed)
-    parts = list(
-        epochs_of(
-            samples,
-            calibration,
-            gravity=gravity,
-            prior=prior,
-            survey_error=survey_error,
-            free_parameters=free_parameters,
-            gain_sigma=gain_sigma,
-        )
-    )
+    parts = list(parts_of(samples, calibration, gravity=gravity))
     result = joined([_solve(epochs) for epochs in parts])
     if samples.ahead is None or prior is not None or len(result) < MIN_EPOCHS:
         return result
