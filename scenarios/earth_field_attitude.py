@@ -100,7 +100,7 @@ def alone(log: Log, site: Site) -> Log:
     source, calibration = demodulated(log, site, None), initial_calibration(site, 0.0)
     fields = source.fields
     silent = replace(fields, phasor_sensor=np.full_like(fields.phasor_sensor, np.nan))
-    return replace(log, waveform=None, fields=silent, steady=source.steady(calibration))
+    return replace(log, waveform=None, fields=silent, static=source.static(calibration))
 
 
 def calibrated(log: Log, site: Site) -> Site:
@@ -114,7 +114,7 @@ def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
     """Return the filter's states, each as it was when it was made."""
     navigator = Navigator(site, NavigatorSettings("ekf", estimate=estimate, earth=True))
     assert log.fields is not None
-    assert log.steady is not None
+    assert log.static is not None
     begun = detected = 0
     for until in np.arange(log.imu.time[0] + PIECE, log.imu.time[-1] + PIECE, PIECE):
         stop = int(np.searchsorted(log.imu.time, until))
@@ -123,7 +123,7 @@ def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
         begun = stop
         stop = int(np.searchsorted(log.fields.time, until))
         part = slice(detected, stop)
-        navigator.add_fields(log.fields.rows(part), log.steady.rows(part))
+        navigator.add_fields(log.fields.rows(part), log.static.rows(part))
         detected = stop
     states = as_trajectory(navigator.take())
     return states.rows(states.time > log.imu.time[0] + CONVERGED_STEP)

@@ -107,7 +107,7 @@ def test_a_smoothed_log_is_separated_from_that_without_the_wheels() -> None:
 def _scored(*, used: bool, rejected: bool) -> Sums:
     """Return the sums of a score after an epoch whose wheels are 10 % too fast."""
     site = aided_site(WHEELS)
-    score = OnlineScore(site, (), (), steady=False)
+    score = OnlineScore(site, (), (), static=False)
     size, cov = len(score.targets.unit), np.diag(np.repeat([0.02, 0.05, 0.05, 0.02, 0.002], 3) ** 2)
     score._sums = new_sums(np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size)), 0.0)
     velocity = np.array([1.0, 0.0, 0.0])

@@ -14,7 +14,7 @@ from test_shared_logs import LOGS, needs_shared_logs
 
 from magfusion.calibration.magnetometer import field_from_measured, spread
 from magfusion.calibration.magnetometer_log import calibrate_log
-from magfusion.calibration.steady_field import steady_field, window_length
+from magfusion.calibration.static_field import static_field, window_length
 from magfusion.calibration.stops import find_stops
 from magfusion.errors import EstimationError, InputError
 from magfusion.files.log import write_log
@@ -76,7 +76,7 @@ def report_of(place: Path) -> dict[str, Any]:
 
 def spread_of(log: Log, site: Site, sensor: Magnetometer) -> float:
     assert log.waveform is not None
-    readings = steady_field(log.waveform, log.imu, site, magnetometer=sensor)
+    readings = static_field(log.waveform, log.imu, site, magnetometer=sensor)
     measured = readings.measured_sensor
     return spread(field_from_measured(measured, sensor.matrix, sensor.offset))
 
@@ -332,7 +332,7 @@ def test_tones_average_out_of_the_steady_field(rotated: tuple[SimulatedLog, Path
     simulated = rotated[0]
     log, site = simulated.log, simulated.true_site
     assert log.waveform is not None
-    readings = steady_field(log.waveform, log.imu, site)
+    readings = static_field(log.waveform, log.imu, site)
     attitude = simulated.motion.world_from_body(readings.time)
     assert site.earth_field_world is not None
     sensor = site.platform.magnetometer
@@ -351,7 +351,7 @@ def test_tones_average_out_of_the_steady_field(rotated: tuple[SimulatedLog, Path
 def test_windows_with_a_gap_are_left_out(rotated: tuple[SimulatedLog, Path]) -> None:
     log, site = rotated[0].log, rotated[0].true_site
     assert log.waveform is not None
-    whole = steady_field(log.waveform, log.imu, site)
+    whole = static_field(log.waveform, log.imu, site)
     for stream in ("waveform", "imu"):
         time = getattr(log, stream).time
         kept = (time < 20.0) | (time > 23.0)
@@ -360,7 +360,7 @@ def test_windows_with_a_gap_are_left_out(rotated: tuple[SimulatedLog, Path]) -> 
             waveform = Waveform(time[kept], waveform.measured_sensor[kept])
         else:
             imu = ImuSamples(time[kept], imu.gyro_body[kept], imu.accel_body[kept])
-        cut = steady_field(waveform, imu, site)
+        cut = static_field(waveform, imu, site)
         assert not np.any((cut.time > 20.0) & (cut.time < 23.0))
         assert len(whole) - 10 <= len(cut) <= len(whole) - 7
         others = np.isin(np.round(whole.time, 6), np.round(cut.time, 6))

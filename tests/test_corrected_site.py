@@ -35,7 +35,7 @@ from magfusion.model.trust import Finding
 from magfusion.simulation.demo_site import demo_site
 
 SITE = demo_site()
-FIXED = fixed_blocks(SITE, (), steady=True)
+FIXED = fixed_blocks(SITE, (), static=True)
 KINDS = ("position", "rotation", "log_moment", "phase", "matrix")
 
 

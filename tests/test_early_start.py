@@ -122,7 +122,7 @@ def test_a_checkpoint_before_a_start_has_the_reason_and_no_corrections() -> None
     site, settings = demo_site(), NavigatorSettings()
     navigator = Navigator(site, settings)
     finding = Finding("mounting", "It is turned.", Verdict.FAILED)
-    fault = next(fault_candidates(site, fixed_blocks(site, (), steady=True)))
+    fault = next(fault_candidates(site, fixed_blocks(site, (), static=True)))
     wrong = NoStart("It is turned.", Trust((finding,)), (Correction(finding, site, fault),))
     loop = navigator._loop
     assert loop.search.accepted(wrong, loop.arrived) is None

@@ -29,7 +29,7 @@ from magfusion.model.parameters import (
     initial_calibration,
     retract,
 )
-from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, StaticFields, Waveform
 from magfusion.model.site import Magnetometer, MagnetometerSigma
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -121,8 +121,8 @@ def test_a_field_of_the_wrong_size_counts_less():
     wrong = (time > 20.0) & (time < 40.0)
     measured = observe_earth(sensor, attitude, earth).measured_sensor
     measured = measured + wrong[:, None] * np.array([0.0, 0.0, 5e-6])
-    steady = SteadyFields(time, measured, np.zeros((len(time), 3, 3)))
-    sigma = np.sqrt(earth_cov(site, steady)[:, 0, 0])
+    static = StaticFields(time, measured, np.zeros((len(time), 3, 3)))
+    sigma = np.sqrt(earth_cov(site, static)[:, 0, 0])
     assert np.all(sigma[(time > 23.0) & (time < 37.0)] > 10.0 * sigma[0])
     np.testing.assert_allclose(sigma[time < 17.0], sigma[0], rtol=1e-9)
 
@@ -217,13 +217,13 @@ def gap():
 def test_the_steady_field_of_a_turning_window_is_that_of_its_centre(gap):
     site, simulated, _ = gap
     true = replace(simulated.true_site, beacons=site.beacons)
-    steady = demodulated(simulated.log, true, None).steady(initial_calibration(true, 0.0))
-    poses = simulated.motion.trajectory(steady.time)
+    static = demodulated(simulated.log, true, None).static(initial_calibration(true, 0.0))
+    poses = simulated.motion.trajectory(static.time)
     sensor = true.platform.magnetometer
     expected = observe_earth(sensor, poses.world_from_body, site.earth_field_world)
-    error = steady.measured_sensor - expected.measured_sensor
+    error = static.measured_sensor - expected.measured_sensor
     assert np.sqrt(np.mean(error**2)) < 5e-8  # T; the gyro's unknown bias turns half a window
-    assert np.max(np.abs(np.diff(steady.measured_sensor, axis=0))) > 1e-6
+    assert np.max(np.abs(np.diff(static.measured_sensor, axis=0))) > 1e-6
 
 
 @pytest.mark.slow

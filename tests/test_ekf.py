@@ -33,7 +33,7 @@ from magfusion.model.parameters import (
     initial_calibration,
     prior_sigma,
 )
-from magfusion.model.samples import ImuSamples, SteadyFields
+from magfusion.model.samples import ImuSamples, StaticFields
 from magfusion.model.site import ClockModel
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
@@ -88,8 +88,8 @@ def an_epoch(site, state, blocks, rng, earth=False):
         seen = observe_earth(
             there.platform.magnetometer, true.world_from_body, there.earth_field_world
         )
-        steady = SteadyFields(samples.time, seen.measured_sensor[None], 1e-18 * np.eye(3)[None])
-        field = earth_measurement(site, steady, now, rate, offset, 0.4)
+        static = StaticFields(samples.time, seen.measured_sensor[None], 1e-18 * np.eye(3)[None])
+        field = earth_measurement(site, static, now, rate, offset, 0.4)
         out.append(replace(field, robust=False))
     return out
 
@@ -320,8 +320,8 @@ def test_an_update_is_that_of_a_graph_in_which_the_clocks_walk():
     assert np.max(np.abs(went - mean) / sigma) < 1e-6 * np.max(np.abs(went / sigma))
     assert np.max(np.abs(light.state.cov - cov) / np.outer(sigma, sigma)) < 1e-6
     # Without the walk the graph would claim a good deal more.
-    _, steady = as_a_graph(start, blocks, predicted, epoch, np.zeros((dimension(blocks), 0)))
-    kept = np.sqrt(np.diag(steady)) / sigma
+    _, static = as_a_graph(start, blocks, predicted, epoch, np.zeros((dimension(blocks), 0)))
+    kept = np.sqrt(np.diag(static)) / sigma
     assert np.min(kept[MOTION:]) < 0.8
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.lockin import WindowOperator, window_operator
@@ -57,7 +57,7 @@ def operator(
 
 def of_white_noise(
     frequency_hz: float, count: int, length: float, averaged: int
-) -> tuple[FieldSamples, SteadyFields]:
+) -> tuple[FieldSamples, StaticFields]:
     imu = still_gyro(-1.0, count * length + 1.0)
     lockin = operator(frequency_hz, count, length, imu, averaged)
     noise = np.random.default_rng(3).normal(0.0, NOISE, (len(lockin.still_from_body[0]), 3))
@@ -76,13 +76,13 @@ def test_the_claimed_variance_is_that_of_both_quadratures(
 ) -> None:
     """In a window of few periods the sine shares its shape with a drift, the cosine does not."""
     count = 2000
-    fields, steady = of_white_noise(frequency_hz, count, length, averaged=50)
+    fields, static = of_white_noise(frequency_hz, count, length, averaged=50)
     result = np.mean(quadratures(fields) ** 2)
     claimed = np.mean(np.diagonal(fields.phasor_cov[:, 0], axis1=1, axis2=2))
     # 12,000 numbers: a variance is within 1.3 %, one sigma, and the claimed one within 1 %.
     assert result / claimed == pytest.approx(1.0, abs=0.06)
-    result = np.mean(steady.measured_sensor**2)
-    claimed = np.mean(np.diagonal(steady.cov, axis1=1, axis2=2))
+    result = np.mean(static.measured_sensor**2)
+    claimed = np.mean(np.diagonal(static.cov, axis1=1, axis2=2))
     assert result / claimed == pytest.approx(1.0, abs=0.08)
 
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import run_command
 
 from magfusion.calibration.magnetometer_size import calibrate_alone
-from magfusion.calibration.steady_field import steady_field
+from magfusion.calibration.static_field import static_field
 from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
@@ -41,7 +41,7 @@ def test_stamps_of_a_host_give_way_to_the_clock_of_the_sensor(host: scenario.Hos
         # Arrival is later than the sample; by how much only the stream's beginning tells.
         assert np.std(off) < 0.1 * step
         assert even.clocks[name].replaced
-    readings = steady_field(even.waveform, even.imu, site)
+    readings = static_field(even.waveform, even.imu, site)
     assert len(readings) > 80
 
 

@@ -220,9 +220,9 @@ def test_missing_motion_is_told_from_what_is_open_and_where_the_platform_was() -
     still = Trajectory(
         np.arange(40.0), np.tile(np.eye(3), (40, 1, 1)), np.tile([3.0, 2.5, 1.0], (40, 1))
     )
-    steady = np.arange(0.0, 40.0, 0.01)
-    moving = 2.0 * np.sin(7.0 * steady)[:, None] * np.ones(3)
-    imu = ImuSamples(steady, moving, moving + np.array([0.0, 0.0, 9.81]))
+    static = np.arange(0.0, 40.0, 0.01)
+    moving = 2.0 * np.sin(7.0 * static)[:, None] * np.ones(3)
+    imu = ImuSamples(static, moving, moving + np.array([0.0, 0.0, 9.81]))
     covered = motion_coverage(still, calibration, imu)
     sensor = still.position_world[0] + site.platform.magnetometer.position_body
     to_c = np.linalg.norm(sensor - site.beacons[2].position_world)

@@ -399,7 +399,7 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
     save_site(site, tmp_path / "site.yaml")
     again = load_site(tmp_path / "site.yaml")
     # The drive belongs to the log: phases and drifts are not the site's.
-    steady = tuple(block for block in ALL if block.group != "phase")
+    static = tuple(block for block in ALL if block.group != "phase")
     expected, result = (
         replace(
             fitted,
@@ -409,7 +409,7 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
         )
         for s in (site, again)
     )
-    step = difference(expected, result, steady)
+    step = difference(expected, result, static)
     assert np.max(np.abs(step)) < 1e-13
     loaded = prior_sigma(choose_blocks(again, GROUPS))
     np.testing.assert_allclose(loaded, prior_sigma(choose_blocks(site, GROUPS)), rtol=1e-12)

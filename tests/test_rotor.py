@@ -185,8 +185,8 @@ def test_a_thin_wall_is_the_limit_of_the_exact_one(frequency_hz: float) -> None:
     assert result.across[0] == pytest.approx(exact.across, rel=5e-3)
     assert result.along[0] == pytest.approx(exact.along, rel=5e-3)
     # Of a static field, in closed form.
-    steady = wall_transmission(Pipe(np.zeros(3), np.ones(3), 0.1, 0.01), 1e-6).across
-    assert steady == pytest.approx(1.0 / (1.0 + 99.0**2 / 400.0 * (1.0 - 0.9**2)), rel=1e-4)
+    static = wall_transmission(Pipe(np.zeros(3), np.ones(3), 0.1, 0.01), 1e-6).across
+    assert static == pytest.approx(1.0 / (1.0 + 99.0**2 / 400.0 * (1.0 - 0.9**2)), rel=1e-4)
 
 
 def test_what_a_casing_gathers_is_that_of_its_poles() -> None:

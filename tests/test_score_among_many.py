@@ -72,7 +72,7 @@ def test_who_comes_later_is_asked_as_if_it_had_been_there_all_the_time() -> None
     rng = np.random.default_rng(3)
     site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
     assert are_many(site)
-    every, some = (OnlineScore(site, (), (), steady=False) for _ in range(2))
+    every, some = (OnlineScore(site, (), (), static=False) for _ in range(2))
     every._detected_at = dict.fromkeys((b.name for b in site.beacons), 0.0)
     every.begin(nothing_yet(every), 0.0)
     some._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
@@ -107,7 +107,7 @@ def test_who_comes_later_is_asked_as_if_it_had_been_there_all_the_time() -> None
 def test_nobody_is_asked_of_long_after_it_was_heard() -> None:
     rng = np.random.default_rng(4)
     site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
-    score = OnlineScore(site, (), (), steady=False)
+    score = OnlineScore(site, (), (), static=False)
     score._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
     score.begin(nothing_yet(score), 0.0)
     for time, detected in ((1.0, 1), (MEMORY + 2.0, 10)):

@@ -66,7 +66,7 @@ def test_of_many_columns_each_channel_whitens_those_that_it_feels(
     small = small_log(3)
     settings = SmootherSettings(tune=False)
     result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
-    blocks = placed((*fixed_blocks(result.declared.site, (), steady=False), *result.field_errors))
+    blocks = placed((*fixed_blocks(result.declared.site, (), static=False), *result.field_errors))
     fields = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))
     at = states_in(result.estimate.values).rows(fields.epoch), result.calibration, blocks
     few = fields.linearize(*at).by_calibration

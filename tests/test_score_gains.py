@@ -13,7 +13,7 @@ KNOWN, UNKNOWN = 50.0, 1e-4  # by how many typical errors a direction is told of
 
 
 def test_all_at_once_gain_what_each_alone_does() -> None:
-    rng, score = np.random.default_rng(4), ScoreTargets(demo_site(), (), (), steady=False)
+    rng, score = np.random.default_rng(4), ScoreTargets(demo_site(), (), (), static=False)
     size = len(score.unit)
     root = rng.standard_normal((size, size)) / np.sqrt(size)
     axes = np.linalg.qr(rng.standard_normal((size, size)))[0]
@@ -45,7 +45,7 @@ def test_beyond_declared_errors_is_what_a_marginal_knows(
 ) -> None:
     """Of an error and a declared one that acts as it does, by inverting the information on both."""
     monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", sparse_from)
-    rng, targets = np.random.default_rng(5), ScoreTargets(demo_site(), (), (), steady=False)
+    rng, targets = np.random.default_rng(5), ScoreTargets(demo_site(), (), (), static=False)
     size = len(targets.unit)
     root = rng.standard_normal((size, 2 * size))
     information, gradient = root @ root.T, rng.standard_normal(size)

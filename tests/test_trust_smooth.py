@@ -199,13 +199,13 @@ def test_the_score_foretells_what_solving_again_finds() -> None:
 
 def test_everything_that_is_held_is_asked() -> None:
     _, site = a_log(1)
-    fixed = fixed_blocks(site, (), steady=False)
+    fixed = fixed_blocks(site, (), static=False)
     kinds = {block.parameter for block in fixed}
     assert {LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION} <= kinds
     assert sum(b.parameter == LOG_MOMENT for b in fixed) == len(site.beacons)
     requested = list(fault_candidates(site, fixed))
     assert len({s.name for s in requested}) >= len(fixed)
-    fewer = fixed_blocks(site, fixed[:3], steady=False)
+    fewer = fixed_blocks(site, fixed[:3], static=False)
     assert {b.key for b in fewer} == {b.key for b in fixed[3:]}
 
 

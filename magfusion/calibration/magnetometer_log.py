@@ -30,7 +30,7 @@ from magfusion.calibration.magnetometer_start import (
     starts,
 )
 from magfusion.calibration.sphere_fit import FIRST_SIGMA, sphere_fits
-from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
+from magfusion.calibration.static_field import LONGEST, StaticField, average, static_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
 from magfusion.model.field import skew
@@ -63,7 +63,7 @@ class LogCalibration:
     magnetometer: Magnetometer  # as calibrated
     graph: GraphFit
     prior: MagnetometerPrior
-    readings: SteadyField  # readings used in the graph
+    readings: StaticField  # readings used in the graph
     field_sigma: float  # estimated noise of a reading (T)
     missing: list[str]  # descriptions of missing orientations
     scale_known: bool  # whether the site's Earth field set the scale; else the declared matrix did
@@ -139,9 +139,9 @@ def calibrate_log(
 
 def _readings(
     waveform: Waveform, imu: ImuSamples, site: Site, known: Magnetometer, at_stops: bool
-) -> SteadyField:
+) -> StaticField:
     if not at_stops:
-        readings = steady_field(waveform, imu, site, magnetometer=known)
+        readings = static_field(waveform, imu, site, magnetometer=known)
         if len(readings) < MIN_EPOCHS:
             raise InputError(
                 f"magnetometer: the log gives {len(readings)} readings; {MIN_EPOCHS} are"
@@ -165,7 +165,7 @@ def _readings(
 
 
 def _refuse_one_axis(
-    readings: SteadyField, known: Magnetometer, field_world: Array | None, missing: list[str]
+    readings: StaticField, known: Magnetometer, field_world: Array | None, missing: list[str]
 ) -> None:
     field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     # Not the directions of the readings: an unknown hard iron hides their rotation.
@@ -188,7 +188,7 @@ def _refuse_few_stops(result: int, missing: list[str]) -> None:
         )
 
 
-def _prior(site: Site, readings: SteadyField) -> MagnetometerPrior:
+def _prior(site: Site, readings: StaticField) -> MagnetometerPrior:
     known, imu = site.platform.magnetometer, site.platform.imu
     field, dip_sigma, size_sigma = site.earth_field_world, KNOWN_DIP, 0.0
     if field is None:
@@ -208,7 +208,7 @@ def _prior(site: Site, readings: SteadyField) -> MagnetometerPrior:
     )
 
 
-def _field_seen(readings: SteadyField, known: Magnetometer, matrix: Array, offset: Array) -> Array:
+def _field_seen(readings: StaticField, known: Magnetometer, matrix: Array, offset: Array) -> Array:
     """Return the Earth field (T) in a world frame whose north is defined by the field."""
     field_body = field_from_measured(readings.measured_sensor, matrix, offset)
     field_body = field_body @ known.body_from_sensor.T
@@ -219,7 +219,7 @@ def _field_seen(readings: SteadyField, known: Magnetometer, matrix: Array, offse
 
 
 def _starts(
-    readings: SteadyField,
+    readings: StaticField,
     imu: ImuSamples,
     site: Site,
     up_sensor: Array,
@@ -241,7 +241,7 @@ def _starts(
     return (*by_size, *starts(readings, imu, lag, known, prior.cov[9:, 9:], size))
 
 
-def _accel_sigma(readings: SteadyField, site: Site, is_stationary: bool) -> Array:
+def _accel_sigma(readings: StaticField, site: Site, is_stationary: bool) -> Array:
     """Return the noise of the specific force, motion included."""
     imu = site.platform.imu
     variance = 1.5 * imu.accel_noise**2 / readings.window + ACCEL_FLOOR**2
@@ -251,7 +251,7 @@ def _accel_sigma(readings: SteadyField, site: Site, is_stationary: bool) -> Arra
     return np.sqrt(variance)
 
 
-def _field_sigma(readings: SteadyField, result: Magnetometer, prior: MagnetometerPrior) -> float:
+def _field_sigma(readings: StaticField, result: Magnetometer, prior: MagnetometerPrior) -> float:
     """Return the noise of a reading from the field's magnitude, which is attitude-independent."""
     field = field_from_measured(readings.measured_sensor, result.matrix, result.offset)
     size = np.linalg.norm(prior.field_world)
@@ -333,7 +333,7 @@ def _part(epochs: MagnetometerEpochs, part: slice) -> MagnetometerEpochs:
 
 
 def _no_better(
-    unseen: float, readings: SteadyField, known: Magnetometer, field_world: Array | None
+    unseen: float, readings: StaticField, known: Magnetometer, field_world: Array | None
 ) -> bool:
     """Return whether the spread is not significantly below that of the declared calibration.
 

@@ -26,7 +26,7 @@ from magfusion.calibration.sphere_fit import (
     sphere_problem,
     sphere_starts,
 )
-from magfusion.calibration.steady_field import SteadyField, steady_alone
+from magfusion.calibration.static_field import StaticField, static_alone
 from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Magnetometer, Site
@@ -45,7 +45,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     solution.
     """
     known = site.platform.magnetometer
-    readings = distinct_fields(steady_alone(waveform, site), known)
+    readings = distinct_fields(static_alone(waveform, site), known)
     _refuse_little(readings, known, site)
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     field_world, size_sigma = site.earth_field_world, 0.0
@@ -97,7 +97,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     )
 
 
-def _refuse_little(readings: SteadyField, known: Magnetometer, site: Site) -> None:
+def _refuse_little(readings: StaticField, known: Magnetometer, site: Site) -> None:
     remedy = "rotate it slowly about all its axes for a minute, or record an IMU as well"
     if len(readings) < MIN_READINGS:
         raise InputError(

@@ -19,7 +19,7 @@ from magfusion.calibration.magnetometer_graph import (
     MagnetometerPrior,
     fit_graph,
 )
-from magfusion.calibration.steady_field import SteadyField
+from magfusion.calibration.static_field import StaticField
 from magfusion.errors import EstimationError
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Magnetometer
@@ -38,7 +38,7 @@ READING = 0.02  # of the field: how wrong turned readings are, against the prior
 
 
 def starts(
-    readings: SteadyField,
+    readings: StaticField,
     imu: ImuSamples,
     time_offset: float,
     known: Magnetometer,

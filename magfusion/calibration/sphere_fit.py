@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.calibration.magnetometer import MagnetometerFit, field_from_measured
 from magfusion.calibration.magnetometer_graph import MagnetometerPrior
 from magfusion.calibration.magnetometer_start import places
-from magfusion.calibration.steady_field import SteadyField
+from magfusion.calibration.static_field import StaticField
 from magfusion.errors import EstimationError
 from magfusion.estimation.solve.batched import NormalEquations, minimise, normal_equations
 from magfusion.model.site import Magnetometer
@@ -72,7 +72,7 @@ class Sphere:
 
 
 def sphere_fits(
-    readings: SteadyField, known: Magnetometer, prior: MagnetometerPrior
+    readings: StaticField, known: Magnetometer, prior: MagnetometerPrior
 ) -> list[MagnetometerFit]:
     """Return the fits by the magnitude alone; none where the readings are too few.
 
@@ -87,7 +87,7 @@ def sphere_fits(
     return [fit_of(state, cov) for state, cov, _ in result]
 
 
-def distinct_fields(readings: SteadyField, known: Magnetometer) -> SteadyField:
+def distinct_fields(readings: StaticField, known: Magnetometer) -> StaticField:
     """Return readings between which the field rotates; repeated readings at rest add nothing."""
     field = field_from_measured(readings.measured_sensor, known.matrix, np.zeros(3))
     reach = NEW * 0.5 * float(np.max(np.ptp(field, axis=0)))
@@ -96,7 +96,7 @@ def distinct_fields(readings: SteadyField, known: Magnetometer) -> SteadyField:
         if np.linalg.norm(field[k] - field[kept[-1]]) > reach:
             kept.append(k)
     rows = np.array(kept)
-    return SteadyField(
+    return StaticField(
         readings.time[rows],
         readings.window[rows],
         readings.measured_sensor[rows],
@@ -105,7 +105,7 @@ def distinct_fields(readings: SteadyField, known: Magnetometer) -> SteadyField:
 
 
 def sphere_starts(
-    readings: SteadyField, prior: MagnetometerPrior, size: float
+    readings: StaticField, prior: MagnetometerPrior, size: float
 ) -> list[MagnetometerFit]:
     """Return initial estimates: the centre of the sphere, on both sides where that is ambiguous."""
     inverse = np.linalg.inv(prior.matrix)
@@ -128,7 +128,7 @@ def sphere_starts(
 
 
 def sphere_problem(
-    readings: SteadyField, prior: MagnetometerPrior, size: float, sigma: float, size_sigma: float
+    readings: StaticField, prior: MagnetometerPrior, size: float, sigma: float, size_sigma: float
 ) -> Sphere:
     """Return the least squares of some readings, with the prior; the sigma of a reading in T."""
     declared = np.concatenate([prior.matrix.ravel(), prior.offset, [1.0]])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from magfusion.calibration.steady_field import average, window_length
+from magfusion.calibration.static_field import average, window_length
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.attitude_table import write_database

@@ -240,7 +240,7 @@ class FieldSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class SteadyFields:
+class StaticFields:
     """Steady part of the waveform, one row for each window: the Earth field and the offset."""
 
     __repr__ = short_repr
@@ -252,9 +252,9 @@ class SteadyFields:
     def __len__(self) -> int:
         return len(self.time)
 
-    def rows(self, kept: BoolArray | slice) -> "SteadyFields":
+    def rows(self, kept: BoolArray | slice) -> "StaticFields":
         """Return a subset of the epochs."""
-        return SteadyFields(self.time[kept], self.measured_sensor[kept], self.cov[kept])
+        return StaticFields(self.time[kept], self.measured_sensor[kept], self.cov[kept])
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class Log:
     """One recording; missing streams are None, a missing IMU is empty.
 
     ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
-    ``steady`` has the times of ``fields`` and is not stored in a file.  ``clocks`` lists streams
+    ``static`` has the times of ``fields`` and is not stored in a file.  ``clocks`` lists streams
     with scattered stamps, ``findings`` other repairs.  If not ``inertial``, the samples of the IMU
     are those of a motion prior (`magfusion.model.without_imu`), not measurements.
     ``temperatures`` are those for which the samples are not corrected yet.  ``drive`` has the
@@ -297,7 +297,7 @@ class Log:
     waveform: Waveform | None = None
     fields: FieldSamples | None = None
     truth: Trajectory | None = None
-    steady: SteadyFields | None = None
+    static: StaticFields | None = None
     clocks: Mapping[str, StreamClock] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     inertial: bool = True

@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.model.detection_range import tones_of
 from magfusion.model.quaternion import inverse, matrices, rotate
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
     Windows,
@@ -74,19 +74,19 @@ class WindowOperator:
             return by_tone
         return np.take(by_tone, self.tone_of_channel, axis=axis)
 
-    def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
+    def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, StaticFields]:
         """Turn raw samples into phasors and the static field, each with covariance.
 
         `measured_sensor` (samples, 3) (T). Where a prediction has been subtracted, the noise next
         to the tones excludes the leakage of motion. For the static field, subtract the known offset
         or a prediction first: the gyro rotates an offset along with the samples.
         """
-        samples, steady, _ = self.demodulate_both(measured_sensor)
-        return samples, steady
+        samples, static, _ = self.demodulate_both(measured_sensor)
+        return samples, static
 
     def demodulate_both(
         self, measured_sensor: Array, others: Array | None = None
-    ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
+    ) -> tuple[FieldSamples, StaticFields, ComplexArray]:
         """Return `demodulate` of a waveform, and the phasors of another at the same sample times.
 
         `others` (samples, 3): the other waveform (T); without it the last result is empty. Returns
@@ -134,7 +134,7 @@ class WindowOperator:
         )
         spread = constant_unit[:, None, None] * np.mean(smooth, axis=1)
         constant[:, range(3) if self.ac_coupled else self.lacking] = np.nan
-        return samples, SteadyFields(centre, constant, spread), self._by_channel(by)
+        return samples, StaticFields(centre, constant, spread), self._by_channel(by)
 
     def unexplained(self, measured_sensor: Array) -> Array:
         """Return the residual power of each window, shape (n,) (T^2)."""

@@ -191,8 +191,8 @@ def _tones_world(
             phasors = ambient.bending.bent_world(i, phasors, point_world)
         own = drives.turning.get(beacon.name)
         if own is not None:
-            steady_world = beacon.world_from_beacon @ own.steady_beacon
-            still = dipole_field(point_world - beacon.position_world, steady_world)
+            static_world = beacon.world_from_beacon @ own.steady_beacon
+            still = dipole_field(point_world - beacon.position_world, static_world)
             yield 0.0, still.astype(np.complex128)
             angle = own.angle(time)
             for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):

@@ -167,12 +167,12 @@ def _with_windows(
         blind=added,
         dropped={reason: count for reason, count in dropped.items() if count},
     )
-    steady = None if log.steady is None else demodulation.steady(calibration)
+    static = None if log.static is None else demodulation.static(calibration)
     return replace(
         log,
         demodulation=demodulation,
         samples=samples,
-        steady=steady,
+        static=static,
         epoch=np.searchsorted(time, samples.time),
         states=whole,
     )

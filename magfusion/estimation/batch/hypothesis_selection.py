@@ -58,7 +58,7 @@ def _part(log: PreprocessedLog, kept: IntArray) -> PreprocessedLog:
     return replace(
         log,
         samples=log.samples.rows(kept),
-        steady=None,
+        static=None,
         epoch=np.arange(len(kept)),
         fixes=None,
         states=states,

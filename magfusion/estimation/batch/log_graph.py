@@ -34,7 +34,7 @@ from magfusion.estimation.posterior.noise_tuning import Tuned, tune
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Block, Calibration, corrected_imu, dimension, placed
-from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.model.samples import FieldSamples, ImuSamples, StaticFields
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -46,7 +46,7 @@ class PreprocessedLog:
 
     demodulation: Demodulation
     samples: FieldSamples  # of the fields, before the motion is known
-    steady: SteadyFields | None  # of the same epochs, where the Earth field is measured
+    static: StaticFields | None  # of the same epochs, where the Earth field is measured
     epoch: IntArray  # (n,), state index of each field epoch
     fixes: Fixes | None  # where they enter the graph instead of the phasors
     start: Start
@@ -249,9 +249,9 @@ def _fields(
         others=False,  # its modes are considered
     )
     out: list[Measurement] = [replace(phasors, robust=log.loss)]
-    if log.steady is not None:
-        steady, step = log.steady if wave is None else wave.steady, _step(samples)
-        out.append(earth_measurement(site, steady, log.epoch, rate_body, offset, step))
+    if log.static is not None:
+        static, step = log.static if wave is None else wave.static, _step(samples)
+        out.append(earth_measurement(site, static, log.epoch, rate_body, offset, step))
         detected = np.any(samples.valid, axis=1)
         out += unobserved_constraints(
             states, log.epoch, detected, step, log.declared.site.platform.motion

@@ -23,7 +23,7 @@ from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import inverse, matrices, of_matrices, product
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, StaticFields
 from magfusion.model.site import Site
 from magfusion.model.strapdown import (
     attitude_at,
@@ -53,15 +53,15 @@ class OfflineStart(NamedTuple):
 
 
 def begin(
-    samples: FieldSamples, steady: SteadyFields | None, log: Log, calibration: Calibration
+    samples: FieldSamples, static: StaticFields | None, log: Log, calibration: Calibration
 ) -> list[OfflineStart]:
     """Return the starts between which the motion selects.
 
-    `steady`: at the same times; without it every epoch needs a beacon.
+    `static`: at the same times; without it every epoch needs a beacon.
     """
     detected = np.asarray(samples.valid.any(axis=1))
-    if steady is not None and np.sum(detected) < LEAST_DETECTED:
-        start = _by_earth(samples, steady, log.imu, calibration.site)
+    if static is not None and np.sum(detected) < LEAST_DETECTED:
+        start = _by_earth(samples, static, log.imu, calibration.site)
         return [OfflineStart(start, start.states, calibration, None)]
     # An epoch without a detection has no fix at all, and would end the chain somewhere.
     some = samples.rows(detected) if np.sum(detected) >= LEAST_DETECTED else samples
@@ -139,10 +139,10 @@ def _rest_bias(imu: ImuSamples, calibration: Calibration) -> Array:
     return np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
 
 
-def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
+def _by_earth(samples: FieldSamples, static: StaticFields, imu: ImuSamples, site: Site) -> Start:
     """Return attitudes from gravity and the Earth field, at rest amid the beacons.
 
-    `samples`: only its times are used. `steady`: at the same times.
+    `samples`: only its times are used. `static`: at the same times.
     """
     assert site.earth_field_world is not None
     time, n = samples.time, len(samples)
@@ -152,7 +152,7 @@ def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site
     rotated, span = attitude.apply(imu.accel_body), site.platform.motion.accel_span
     up_body = at_epochs.inv().apply(mean_about(stamps, rotated, time, span))
     sensor = site.platform.magnetometer
-    field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
+    field = (static.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     field_body = field @ sensor.body_from_sensor.T
     middle = np.mean([b.position_world for b in site.beacons], axis=0)
     return Start(

@@ -25,7 +25,7 @@ from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration, initial_calibration
 from magfusion.model.progress import Report
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, StaticFields
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.cycles import whole_cycles
@@ -55,7 +55,7 @@ class _Demodulated(NamedTuple):
     log: Log
     demodulation: Demodulation
     samples: FieldSamples
-    steady: SteadyFields | None
+    static: StaticFields | None
     time: Array
     calibration: Calibration
     measured: tuple[tuple[Array, Measurement], ...]
@@ -71,7 +71,7 @@ def preprocess(log: Log, site: Site, settings: SmootherSettings, report: Report)
     detected = _demodulated(log, site, settings)
     report("finding a start", 1, settings.max_iterations + 3)
     imu, offset = detected.log.imu, detected.calibration.time_offset
-    beginnings = begin(detected.samples, detected.steady, detected.log, detected.calibration)
+    beginnings = begin(detected.samples, detected.static, detected.log, detected.calibration)
     imu = unbiased(imu, detected.samples, offset)
     starts = [
         _with_start(
@@ -135,10 +135,10 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
         )
     begin_imu = float(log.imu.time[0])
     calibration = initial_calibration(site, float(np.mean(samples.time)), begin_imu)
-    steady = None
+    static = None
     log = replace(log, imu=calibration.on_log_rate(log.imu))
     if settings.earth:
-        steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
+        static, samples = demodulation.static(calibration), only(samples, detected(samples))
     between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
     measured = (*settings.measurements, *_aiding(log, calibration, samples, settings.loss))
     time = np.union1d(samples.time, between)
@@ -153,7 +153,7 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
     if user is not None:
         user = replace(user, time=at_epochs(user.time, time))
         time = np.union1d(time, user.time)
-    return _Demodulated(log, demodulation, samples, steady, time, calibration, tuple(at), user)
+    return _Demodulated(log, demodulation, samples, static, time, calibration, tuple(at), user)
 
 
 def _aiding(
@@ -175,7 +175,7 @@ def _with_start(
     return PreprocessedLog(
         demodulation=selected.demodulation,
         samples=selected.samples,
-        steady=selected.steady,
+        static=selected.static,
         epoch=np.searchsorted(selected.time, selected.samples.time),
         fixes=fixes if loose else None,
         start=begun.start,

@@ -100,7 +100,7 @@ def recorded(
     mounted = site is None or is_mounted(site)
     of_turn = list(turned_otherwise(log, site)) if log.inertial and mounted else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in (*result, *of_turn)):
-        result += _steady_findings(log, site, of_turn, poses, estimated, mounted=mounted)
+        result += _static_findings(log, site, of_turn, poses, estimated, mounted=mounted)
         if not any(finding.code in OF_GRAVITY for finding in result):
             result += truth_findings(log)
     else:
@@ -117,7 +117,7 @@ def is_mounted(site: Site) -> bool:
     return bool(np.max(site.platform.magnetometer.sigma.rotation_sensor) < MOUNTED)
 
 
-def _steady_findings(
+def _static_findings(
     log: Log,
     site: Site | None,
     of_turn: Sequence[Finding],

@@ -23,7 +23,7 @@ from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import tones_of
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import unit
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
 from magfusion.model.trajectory import Trajectory, interpolated
@@ -63,26 +63,26 @@ class Demodulation:
         """Whether samples are available to demodulate again, once the motion is known."""
         return self.log.waveform is not None
 
-    def steady(self, calibration: Calibration) -> SteadyFields:
+    def static(self, calibration: Calibration) -> StaticFields:
         """Return the Earth field and the offset before the motion is known.
 
         Raises InputError where the log has only phasors, or time slots.
         """
         waveform = self.log.waveform
         if self.receiver is None or waveform is None:
-            if self.log.steady is None:
+            if self.log.static is None:
                 raise InputError(
                     "the log has only phasors, which do not contain the Earth field; give the"
                     " log with magnetometer.parquet, or omit --earth"
                 )
-            return self.log.steady
+            return self.log.static
         assert self.windows is not None
         site, receiver = calibration.site, windowed(self.receiver)
         imu = on_clock(calibration.on_log_rate(self.log.imu), calibration.time_offset)
         operator = receiver.operator(waveform, imu, self.windows, site)
         offset = site.platform.magnetometer.offset
-        _, steady = operator.demodulate(waveform.measured_sensor - offset)
-        return replace(steady, measured_sensor=steady.measured_sensor + offset)
+        _, static = operator.demodulate(waveform.measured_sensor - offset)
+        return replace(static, measured_sensor=static.measured_sensor + offset)
 
     def compensated(
         self, calibration: Calibration, states: Trajectory, path: Trajectory | None = None

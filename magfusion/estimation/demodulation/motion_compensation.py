@@ -17,7 +17,7 @@ from magfusion.model.field import predict_earth
 from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
 from magfusion.model.quaternion import unit
-from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.waveform import MotionChange, carriers, predicted_waveform
@@ -39,7 +39,7 @@ class MotionCompensated:
     # (n, channels, 3), derivative of the removed effect by the IMU's time offset at fixed states
     # (T/s)
     by_time_offset: ComplexArray
-    steady: SteadyFields  # the Earth field and the offset
+    static: StaticFields  # the Earth field and the offset
     unseen: bool = False  # whether the motion was unknown, and nothing was removed
     # (samples, 3), samples minus their prediction (T), where requested with ``wanted``
     unexplained_sensor: Array | None = None
@@ -49,8 +49,8 @@ class MotionCompensated:
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
         """Return phasors of slots: too short for motion, and without a static field."""
         none = np.full((len(fields), 3), np.nan)
-        steady = SteadyFields(fields.time, none, np.full((*none.shape, 3), np.nan))
-        return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady)
+        static = StaticFields(fields.time, none, np.full((*none.shape, 3), np.nan))
+        return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), static)
 
 
 class TakenOff(NamedTuple):
@@ -171,14 +171,14 @@ def demodulate_about(
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
-    steady = predict_earth(site.platform.magnetometer, states.world_from_body, earth)
+    static = predict_earth(site.platform.magnetometer, states.world_from_body, earth)
     fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
     return MotionCompensated(
         fields=fields
         if operator.tone_of_channel is None
         else _of_strongest(fields, active_beacons, states),
         by_time_offset=by_time_offset,
-        steady=replace(remaining, measured_sensor=remaining.measured_sensor + steady),
+        static=replace(remaining, measured_sensor=remaining.measured_sensor + static),
         unexplained_sensor=None if wanted is None else unexplained,
         wanted=off.wanted,
     )
@@ -206,9 +206,9 @@ def _without_motion(
     operator: WindowOperator, measured_sensor: Array, offset: Array
 ) -> MotionCompensated:
     """Demodulate windows of unknown motion."""
-    fields, steady = operator.demodulate(measured_sensor - offset)
-    steady = replace(steady, measured_sensor=steady.measured_sensor + offset)
-    return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady, unseen=True)
+    fields, static = operator.demodulate(measured_sensor - offset)
+    static = replace(static, measured_sensor=static.measured_sensor + offset)
+    return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), static, unseen=True)
 
 
 def _by_strength(operator: WindowOperator, measured_sensor: Array, site: Site) -> MotionCompensated:

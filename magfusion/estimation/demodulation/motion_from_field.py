@@ -40,7 +40,7 @@ class _Motion:
     position_world: Array
     velocity_world: Array
     rate_body: Array
-    steady_world: Array
+    static_world: Array
     cov: Array  # (15, 15): rotation and position in body axes, as of a pose
 
     def moved(self, step: Array, cov: Array) -> "_Motion":
@@ -50,7 +50,7 @@ class _Motion:
             self.position_world + self.world_from_body @ step[PLACE],
             self.velocity_world + step[SPEED],
             self.rate_body + step[RATE],
-            self.steady_world + step[STEADY],
+            self.static_world + step[STEADY],
             cov,
         )
 
@@ -63,7 +63,7 @@ class _Motion:
                 back @ (other.position_world - self.position_world),
                 other.velocity_world - self.velocity_world,
                 other.rate_body - self.rate_body,
-                other.steady_world - self.steady_world,
+                other.static_world - self.static_world,
             ]
         )
 
@@ -209,13 +209,13 @@ def _updated(
     sensor = calibration.site.platform.magnetometer
     pose = motion.world_from_body, motion.position_world
     tones, by_pose, size = _predicted(calibration, time, *pose)
-    steady = observe_earth(sensor, motion.world_from_body, motion.steady_world)
+    static = observe_earth(sensor, motion.world_from_body, motion.static_world)
     by = np.zeros((3, MOTION))
     by[:, :6] = by_pose
-    by[:, TURN] += steady.platform_rotation
-    by[:, STEADY] = steady.earth_world
-    error = measured - tones - steady.measured_sensor
-    sigma = np.hypot(STEADY_ERROR * np.linalg.norm(motion.steady_world), FIELD_ERROR * size)
+    by[:, TURN] += static.platform_rotation
+    by[:, STEADY] = static.earth_world
+    error = measured - tones - static.measured_sensor
+    sigma = np.hypot(STEADY_ERROR * np.linalg.norm(motion.static_world), FIELD_ERROR * size)
     across = by @ motion.cov
     spread = across @ by.T + sigma**2 * np.eye(3)
     gain = np.linalg.solve(spread, across).T

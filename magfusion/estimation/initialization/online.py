@@ -29,7 +29,7 @@ from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.detection_range import are_many
 from magfusion.model.marks import Marks
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.cycles import cycle_of, cycles, joins
@@ -93,7 +93,7 @@ def find_online_start(
     imu: ImuSamples,
     waveform: Buffer,
     fields: list[FieldSamples],
-    steady: list[SteadyFields],
+    static: list[StaticFields],
     until: float,
     settings: EstimatorSettings,
     marks: Marks | None = None,
@@ -107,7 +107,7 @@ def find_online_start(
     ----------
     fields : list of FieldSamples
         One epoch each; used where present.
-    steady : list of SteadyFields
+    static : list of StaticFields
         Of the same epochs as ``fields``.
     until : float
         (s)
@@ -135,7 +135,7 @@ def find_online_start(
         clock_rate=site.platform.magnetometer.clock_rate,
         waveform=None if fields or several else wave.rows(wave.time <= until),
         fields=FieldSamples.joined(whole) if whole else None,
-        steady=_joined_steady(steady, whole) if whole and steady else None,
+        static=_joined_static(static, whole) if whole and static else None,
         inertial=site.platform.inertial,
         waveforms=several,
     )
@@ -316,14 +316,14 @@ def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:
     return float(turn), float(shift)
 
 
-def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> SteadyFields | None:
+def _joined_static(parts: list[StaticFields], fields: list[FieldSamples]) -> StaticFields | None:
     """Return the static fields of the epochs; None where an epoch has none."""
     known = {float(part.time[0]): part for part in parts}
     wanted = [known.get(float(s.time[0])) for s in fields]
     result = [part for part in wanted if part is not None]
     if len(result) < len(wanted):
         return None
-    return SteadyFields(
+    return StaticFields(
         time=np.concatenate([p.time for p in result]),
         measured_sensor=np.concatenate([p.measured_sensor for p in result]),
         cov=np.concatenate([p.cov for p in result]),

@@ -76,10 +76,10 @@ def _contradicts(known: Snapshots, without: Snapshots, name: str) -> bool:
     return known.rejects_rest(without, tests) or known.rejects(released, tests)
 
 
-def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
+def matrix_causes(known: Snapshots, static: float | None) -> Iterator[Explanation]:
     """Yield what iron on the body, or another scale of all fields, would explain.
 
-    `steady`: usual size of the static field, relative to the Earth's.
+    `static`: usual size of the static field, relative to the Earth's.
     """
     released = [(MATRIX, MATRIX.owner, 0.3)]
     if known.excess < MISFIT and not known.rejects(released, tests=1):
@@ -91,7 +91,7 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
     scale = float(np.trace(even)) / 3.0
     uneven = float(np.max(np.abs(even - scale * np.eye(3))))
     if uneven < max(0.1 * abs(scale), 0.003):
-        yield from _scales(known, 1.0 + scale, steady)
+        yield from _scales(known, 1.0 + scale, static)
         return
     yield _explained(
         known,
@@ -142,7 +142,7 @@ def survey_causes(known: Snapshots) -> Iterator[Explanation]:
     )
 
 
-def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Explanation]:
+def _scales(known: Snapshots, scale: float, static: float | None) -> Iterator[Explanation]:
     """Yield what fields so many times as large as declared mean."""
     trial = scale * np.array([0.98, 1.0, 1.02])
     costs = [known.of(_stronger(known.site, s)).chi_square for s in trial]
@@ -155,7 +155,7 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
         metric = in_other_unit(known.site, units[0])
         yield _explained(known, after, 0, *length_cause(units[0]), metric)
         return
-    if steady is not None and abs(steady / best - 1.0) < abs(steady - 1.0) / 3.0:
+    if static is not None and abs(static / best - 1.0) < abs(static - 1.0) / 3.0:
         code, cause = "field_scale", f"the magnetometer's readings are {best:.4g} times the field"
         remedy = "Check its unit (T) and platform.magnetometer.matrix."
     else:

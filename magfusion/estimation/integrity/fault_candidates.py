@@ -177,10 +177,10 @@ class FaultCandidate(NamedTuple):
         return self.code or CODE[self.blocks[0].parameter]
 
 
-def fixed_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
+def fixed_blocks(site: Site, estimated: tuple[Block, ...], *, static: bool) -> tuple[Block, ...]:
     """Return every parameter that is not estimated, with its typical error for a sigma.
 
-    `steady`: whether the static field is measured.
+    `static`: whether the static field is measured.
     """
     known = {block.key for block in estimated}
     every = (*PARAMETERS, *INERTIAL)
@@ -192,7 +192,7 @@ def fixed_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> t
         every = tuple(p for p in every if p != CONDUCTIVITY)
     if not site.platform.further:  # the log's clock is that of the only one
         every = tuple(p for p in every if p != CLOCK_OFFSET)
-    kinds = [p for p in every if steady or not p.steady_only]
+    kinds = [p for p in every if static or not p.static_only]
     return placed(
         Block(kind, owner, slice(0), np.full(len(kind.sigma(site, owner)), TYPICAL[kind]))
         for kind, owner in candidates(site, kinds)

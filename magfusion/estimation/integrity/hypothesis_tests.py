@@ -61,7 +61,7 @@ def cause_of(
     if len(samples) < MIN_EPOCHS:
         return None
     known = snapshots_of(samples, part.imu, site)
-    tried = _of_fields(known, samples, _steady(part, site))
+    tried = _of_fields(known, samples, _static(part, site))
     of_fields, of_motion = clearly_best(tried), None
     if of_fields is None and any(one.clear for one in tried):
         return None  # it is of the fields, whichever it is: no inertial sensor explains it
@@ -164,7 +164,7 @@ def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> Field
     return min(trials, key=lambda pair: pair[0])[1]
 
 
-def _steady(log: Log, site: Site) -> float | None:
+def _static(log: Log, site: Site) -> float | None:
     """Return the usual size of the field, relative to the Earth's."""
     if log.vectors is None or site.earth_field_world is None:
         return None
@@ -172,8 +172,8 @@ def _steady(log: Log, site: Site) -> float | None:
     return float(np.median(size) / np.linalg.norm(site.earth_field_world))
 
 
-def _of_fields(known: Snapshots, samples: FieldSamples, steady: float | None) -> list[Explanation]:
-    tried = [*matrix_causes(known, steady), *beacon_causes(known), *phase_causes(known, samples)]
+def _of_fields(known: Snapshots, samples: FieldSamples, static: float | None) -> list[Explanation]:
+    tried = [*matrix_causes(known, static), *beacon_causes(known), *phase_causes(known, samples)]
     best = clearly_best(tried)
     if best is None or best.after > ENOUGH * best.expected:
         tried += global_causes(known)
@@ -222,5 +222,5 @@ def _part(log: Log) -> Log:
         imu=ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept]),
         waveform=None if wave is None else wave.rows(within(wave.time)),
         fields=None if fields is None else fields.rows(within(fields.time)),
-        steady=None,
+        static=None,
     )

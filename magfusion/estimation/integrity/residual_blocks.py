@@ -15,6 +15,7 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, calibrated, iron_on_body
 from magfusion.estimation.data_checks.data_quality import beginning, is_mounted
+from magfusion.estimation.data_checks.static_field import OffEarth, off_earth
 from magfusion.estimation.data_checks.statistics import (
     TEST_BUDGET,
     effective_number,
@@ -22,7 +23,6 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
-from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
 from magfusion.estimation.data_checks.still_means import SPAN, still_means
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import states_in

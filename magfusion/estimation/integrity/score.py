@@ -121,8 +121,8 @@ def scores_of(
     known = result.declared.site
     if not known.platform.inertial and len(known.beacons) == 1:
         return None  # a single beacon is only contradicted by the smoothness of the path
-    steady = any(isinstance(m, EarthField) for m in graph.measurements)
-    fixed = fixed_blocks(known, result.blocks, steady=steady)
+    static = any(isinstance(m, EarthField) for m in graph.measurements)
+    fixed = fixed_blocks(known, result.blocks, static=static)
     if not fixed:
         return None
     every = placed((*fixed, *columns))

@@ -28,9 +28,9 @@ from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.model.field import observe_earth
 from magfusion.model.noise import whitening
-from magfusion.model.parameters import Block, Calibration, SteadyView
+from magfusion.model.parameters import Block, Calibration, StaticView
 from magfusion.model.physics.earth import AMBIENT_SHARE
-from magfusion.model.samples import SteadyFields
+from magfusion.model.samples import StaticFields
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -81,9 +81,9 @@ class EarthField(Measurement):
         by_pose = np.zeros((len(error), 1, 3, 6))
         by_pose[:, 0, :, :3] = self.sqrt_information @ seen.platform_rotation
         by_calibration = calibration_rows((len(error), 1, 3), blocks)
-        view = SteadyView(calibration, seen, self.rate_body, self.time)
+        view = StaticView(calibration, seen, self.rate_body, self.time)
         for block in blocks:
-            part = block.parameter.steady_jacobian(view)
+            part = block.parameter.static_jacobian(view)
             if part is not None:
                 by_calibration[:, 0, :, block.columns] = self.sqrt_information @ part
         return Rows(error[:, None, :, 0], by_pose, by_calibration=by_calibration)
@@ -91,7 +91,7 @@ class EarthField(Measurement):
 
 def earth_measurement(
     site: Site,
-    steady: SteadyFields,
+    static: StaticFields,
     epoch: IntArray,
     rate_body: Array,
     applied_offset: Array,
@@ -101,7 +101,7 @@ def earth_measurement(
 
     Parameters
     ----------
-    steady : SteadyFields
+    static : StaticFields
         NaN where missing.
     epoch : int ndarray, shape (n,)
         Indices of their states.
@@ -113,11 +113,11 @@ def earth_measurement(
         Time between epochs (s).
     """
     repeats = max(1.0, AMBIENT_TIME / step)
-    there = np.isfinite(steady.measured_sensor)
-    sqrt_information = whitening(repeats * earth_cov(site, steady), there)
-    measured = np.nan_to_num(steady.measured_sensor)
+    there = np.isfinite(static.measured_sensor)
+    sqrt_information = whitening(repeats * earth_cov(site, static), there)
+    measured = np.nan_to_num(static.measured_sensor)
     return EarthField(
-        epoch, steady.time, measured, sqrt_information, rate_body, repeats, applied_offset
+        epoch, static.time, measured, sqrt_information, rate_body, repeats, applied_offset
     )
 
 
@@ -144,17 +144,17 @@ def check_earth(site: Site) -> None:
         )
 
 
-def earth_cov(site: Site, steady: SteadyFields) -> Array:
+def earth_cov(site: Site, static: StaticFields) -> Array:
     """Return the covariance of each static field, shape (n, 3, 3), measured axes (T^2)."""
     assert site.earth_field_world is not None
     sensor = site.platform.magnetometer
     size = float(np.linalg.norm(site.earth_field_world))
-    field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
+    field = (static.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     deviation = (np.linalg.norm(field, axis=1) - size) ** 2
     if len(sensor.axes) < 3:  # the magnitude is unknown
-        deviation = np.zeros(len(steady))
-    ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(steady.time, deviation)
-    return steady.cov + ambient[:, None, None] * np.eye(3)
+        deviation = np.zeros(len(static))
+    ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(static.time, deviation)
+    return static.cov + ambient[:, None, None] * np.eye(3)
 
 
 def _moving_mean(time: Array, value: Array) -> Array:

@@ -88,7 +88,7 @@ class EpochUpdate:
         self._roll = roll_findings(site)
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
         self.monitor = OnlineMonitor(site, estimated)
-        self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
+        self.score = OnlineScore(site, estimated, blocks[len(estimated) :], static=earth)
         self.settlement = SettlementTest(site)
         self.recovery = LossRecovery(self.gate, blocks, lost_beyond)
         self._comparison = FixComparison()
@@ -222,9 +222,9 @@ class EpochUpdate:
         if elapsed > 0.0 and not predicted.gap_bridged:
             gained = predicted.state.velocity_world - before.velocity_world
             accel = gained / elapsed + before.world_from_body @ before.accel_bias_body
-        steady = None if measured is None else measured.steady
+        static = None if measured is None else measured.static
         repeats = 1.0 if measured is None else measured.repeats
-        self.monitor.update(state, self.gate, EpochSummary(accel, elapsed, steady, repeats))
+        self.monitor.update(state, self.gate, EpochSummary(accel, elapsed, static, repeats))
 
     def _separate(
         self, predicted: Propagated | None, measurements: list[Measurement], state: State

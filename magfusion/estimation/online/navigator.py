@@ -34,7 +34,7 @@ from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
 from magfusion.model.platform_motion import NO_IMU
-from magfusion.model.samples import FieldSamples, SteadyFields
+from magfusion.model.samples import FieldSamples, StaticFields
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
@@ -164,7 +164,7 @@ class Navigator:
         """Set the temperature (deg C) at a time (s) of a beacon or the ``magnetometer``."""
         self._readings.temperatures.add_reading(part, time, degc)
 
-    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
+    def add_fields(self, samples: FieldSamples, static: StaticFields | None = None) -> None:
         """Add phasors (T), channels in the site's order, with static fields (T) if measured.
 
         Raises
@@ -172,11 +172,11 @@ class Navigator:
         InputError
             If the clock jumped.
         """
-        steady_used = steady if self.settings.earth else None
-        late = self._loop.arrived.add_fields(samples, steady_used, self.time)
+        static_used = static if self.settings.earth else None
+        late = self._loop.arrived.add_fields(samples, static_used, self.time)
         if late:
             self.counts["field too late"] += late
-        self._history.add(samples.time, "add_fields", samples, steady)
+        self._history.add(samples.time, "add_fields", samples, static)
         self._advance_with_motion_prior()
 
     def _advance_with_motion_prior(self) -> None:

@@ -49,7 +49,7 @@ def next_epoch(
         time = float(samples.time[0])
         if time > now:
             return NextEpoch(time, samples)
-        arrived.steady.pop(time, None)
+        arrived.static.pop(time, None)
         return TooLate("field too late")
     if not arrived.window_to_come and inertial - now >= settings.longest_step:
         return NextEpoch(now + settings.longest_step)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from magfusion.estimation.data_checks.static_field import DOUBT
 from magfusion.estimation.data_checks.statistics import DETECTION_SIGMAS
-from magfusion.estimation.data_checks.steady_field import DOUBT
 from magfusion.estimation.graph.preintegration import bias_walks
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.judgement import Judgement

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, erfc
 
+from magfusion.estimation.data_checks.static_field import DOUBT, off_earth
 from magfusion.estimation.data_checks.statistics import largest_mean_square
-from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.imu_checks import judge_biases, judge_gravity
@@ -26,7 +26,7 @@ from magfusion.model.parameters import (
     initial_calibration,
     prior_sigma,
 )
-from magfusion.model.samples import SteadyFields
+from magfusion.model.samples import StaticFields
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
@@ -62,7 +62,7 @@ class EpochSummary:
     # residual of gravity (m/s^2)
     accel_world: Array | None = None
     elapsed: float = 0.0  # since that epoch (s)
-    steady: SteadyFields | None = None  # the static field of the window
+    static: StaticFields | None = None  # the static field of the window
     repeats: float = 1.0  # number of epochs that contain each sample of overlapping windows
 
 
@@ -133,11 +133,11 @@ class OnlineMonitor:
         if epoch.accel_world is not None:
             accel, weight = epoch.accel_world, epoch.elapsed
             self._gravity = self._gravity.with_sample(accel, time, MEMORY, weight)
-        if epoch.steady is not None:
-            self._update_steady(state, epoch.steady)
+        if epoch.static is not None:
+            self._update_static(state, epoch.static)
 
-    def _update_steady(self, state: State, steady: SteadyFields) -> None:
-        measured, earth = steady.measured_sensor[0], self.site.earth_field_world
+    def _update_static(self, state: State, static: StaticFields) -> None:
+        measured, earth = static.measured_sensor[0], self.site.earth_field_world
         if earth is None or not np.all(np.isfinite(measured)):
             return
         sensor = self.site.platform.magnetometer

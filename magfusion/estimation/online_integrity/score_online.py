@@ -57,7 +57,7 @@ MOST_WAITING = 10  # epochs; larger batches would delay an update
 class OnlineScore:
     """Score test of a running estimate's fixed parameters; of many beacons, of detected ones.
 
-    `estimated`, `considered`: calibration parameters in the state's tangent. `steady`: whether the
+    `estimated`, `considered`: calibration parameters in the state's tangent. `static`: whether the
     static field is measured. Attribute `correction`: of the cause in the last result, if there is
     one.
     """
@@ -76,9 +76,9 @@ class OnlineScore:
         estimated: tuple[Block, ...],
         considered: tuple[Block, ...],
         *,
-        steady: bool,
+        static: bool,
     ) -> None:
-        self.site, self._tangent, self._steady = site, (estimated, considered), steady
+        self.site, self._tangent, self._static = site, (estimated, considered), static
         self._each_alone = any(b.parameter not in (TIME_OFFSET, CLOCK_RATE) for b in estimated)
         self._sums, self._scored_at, self._judgement = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
@@ -107,7 +107,7 @@ class OnlineScore:
         estimated, considered = self._tangent
         site = of_beacons_named(self.site, names)
         steel = self._steel
-        return ScoreTargets(site, estimated, considered, steady=self._steady, steel=steel)
+        return ScoreTargets(site, estimated, considered, static=self._static, steel=steel)
 
     def begin(self, score: Score | None, time: float) -> None:
         """Continue from the score of the smoothed beginning, at its last state (s)."""

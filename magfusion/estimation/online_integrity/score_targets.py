@@ -31,7 +31,7 @@ class ScoreTargets:
         With the tested beacons.
     estimated, considered : tuple of Block
         Calibration parameters in the state's tangent, of all beacons.
-    steady : bool
+    static : bool
         Whether the static field is measured.
     steel : tuple of Block
         Amplitudes of `magfusion.estimation.measurements.steel.region_modes`, tested last.
@@ -43,10 +43,10 @@ class ScoreTargets:
         estimated: tuple[Block, ...],
         considered: tuple[Block, ...],
         *,
-        steady: bool,
+        static: bool,
         steel: tuple[Block, ...] = (),
     ) -> None:
-        fixed = fixed_blocks(site, estimated, steady=steady)
+        fixed = fixed_blocks(site, estimated, static=static)
         self.site, self.fixed_blocks, self.steel = site, placed((*fixed, *steel)), steel
         self.names = tuple(beacon.name for beacon in site.beacons)
         self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)

@@ -35,7 +35,7 @@ from magfusion.model.parameters.parameter import Block as Block
 from magfusion.model.parameters.parameter import Calibration as Calibration
 from magfusion.model.parameters.parameter import Parameter as Parameter
 from magfusion.model.parameters.parameter import ParameterUnit as ParameterUnit
-from magfusion.model.parameters.parameter import SteadyView as SteadyView
+from magfusion.model.parameters.parameter import StaticView as StaticView
 from magfusion.model.parameters.parameter import dimension as dimension
 from magfusion.model.parameters.platform import CLOCK_OFFSET as CLOCK_OFFSET
 from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
@@ -89,7 +89,7 @@ GROUPS = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 def of_phasors(parameters: Iterable[Parameter]) -> tuple[Parameter, ...]:
     """Return the parameters that affect more than the static field."""
-    return tuple(parameter for parameter in parameters if not parameter.steady_only)
+    return tuple(parameter for parameter in parameters if not parameter.static_only)
 
 
 PHASOR_PARAMETERS = of_phasors(PARAMETERS)

@@ -138,7 +138,7 @@ class PhasorView(NamedTuple):
         return self.observation
 
 
-class SteadyView(NamedTuple):
+class StaticView(NamedTuple):
     """Inputs of the Jacobian of the static field."""
 
     calibration: Calibration
@@ -169,7 +169,7 @@ class Parameter:
     declared: ClassVar[bool] = False  # whether the site's file has its value and its sigma
     of_log: ClassVar[bool] = False  # whether it belongs to the log and is only recorded in the site
     each_log: ClassVar[bool] = False  # whether every log has its own value, declared or not
-    steady_only: ClassVar[bool] = False  # whether only the static field determines it
+    static_only: ClassVar[bool] = False  # whether only the static field determines it
     factor_of_phasor: ClassVar[bool] = False  # whether its Jacobian is proportional to the phasor
     inertial: ClassVar[bool] = False  # whether it corrects the inertial stream
     # Its mean variance, times this and this power of the inverse distance, is the relative
@@ -237,7 +237,7 @@ class Parameter:
         """Return its columns, shape (n, tones, 3, columns); None without an effect."""
         return None
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         """Return its columns, shape (n, 3, columns); None without an effect."""
         return None
 

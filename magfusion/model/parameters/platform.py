@@ -20,7 +20,7 @@ from magfusion.model.parameters.parameter import (
     ParameterUnit,
     PhasorView,
     SiteParameter,
-    SteadyView,
+    StaticView,
 )
 from magfusion.model.response import ResponseSigma, changed_axes, log_response
 from magfusion.model.site import Magnetometer, Site
@@ -97,7 +97,7 @@ class _Matrix(MagnetometerParameter):
     def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         return view.whole.matrix
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         return view.observation.matrix
 
 
@@ -107,10 +107,10 @@ class _Offset(MagnetometerParameter):
     unit, display_unit, si = ParameterUnit("nt", 1e-3), ParameterUnit("nT", 1e-3), MICROTESLA
     words = "the magnetometer's offset on {axis}"
     negligible = 5e-3
-    steady_only = True
+    static_only = True
     walk = "platform.magnetometer.offset_walk"
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         return MICROTESLA * view.observation.offset
 
 
@@ -195,7 +195,7 @@ class _Rotation(MagnetometerParameter):
     def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         return view.whole.body_from_sensor[..., :3]
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         return view.observation.sensor_rotation
 
 
@@ -281,7 +281,7 @@ class _TimeOffset(Parameter):
             raise ValueError("twist_body must be given where the time offset is estimated")
         return view.whole.time_offset[..., None]
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         return -view.observation.platform_rotation @ view.rate_body[..., None]
 
 
@@ -316,8 +316,8 @@ class _ClockRate(Parameter):
         time = view.calibration.reference_time + view.elapsed
         return by_offset * _running(view.calibration, time)[:, None, None, None]
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
-        by_offset = TIME_OFFSET.steady_jacobian(view)
+    def static_jacobian(self, view: StaticView) -> Array | None:
+        by_offset = TIME_OFFSET.static_jacobian(view)
         assert by_offset is not None
         return by_offset * _running(view.calibration, view.time)[:, None, None]
 
@@ -338,7 +338,7 @@ class _EarthParameter(Parameter):
     """Cylindrical coordinates of the Earth field about the vertical."""
 
     group, owner = "earth", "earth"
-    steady_only = True
+    static_only = True
     coordinates: ClassVar[slice]
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
@@ -356,7 +356,7 @@ class _EarthParameter(Parameter):
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         return replace(site, location=None)  # the estimate replaces the location's field
 
-    def steady_jacobian(self, view: SteadyView) -> Array | None:
+    def static_jacobian(self, view: StaticView) -> Array | None:
         azimuth, level, _ = _cylindrical(view.calibration)
         s, c = np.sin(azimuth), np.cos(azimuth)
         by_all = np.array([[-level * s, c, 0.0], [level * c, s, 0.0], [0.0, 0.0, 1.0]])

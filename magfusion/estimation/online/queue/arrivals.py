@@ -33,7 +33,7 @@ from magfusion.estimation.online.queue.short_windows import ShortWindows
 from magfusion.estimation.online.queue.still_samples import StillSamples
 from magfusion.model.aiding import AidingSamples, sensor_named
 from magfusion.model.marks import Marks
-from magfusion.model.samples import FieldSamples, SteadyFields
+from magfusion.model.samples import FieldSamples, StaticFields
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array, IntArray
@@ -52,7 +52,7 @@ class Arrivals(ABC):
     imu: InertialStream  # of the motion prior, where the platform has none
     streams: list[SensorStream]  # raw samples of each magnetometer; empty where fields are given
     fields: list[FieldSamples]  # one epoch each, the oldest first
-    steady: dict[float, SteadyFields]  # by the time of the epoch (s), its static fields
+    static: dict[float, StaticFields]  # by the time of the epoch (s), its static fields
     others: OtherMeasurements
     last_epoch: float  # time of the last fields (s)
     # of tones that are close, where one magnetometer measures them together
@@ -66,7 +66,7 @@ class Arrivals(ABC):
     def __init__(self, site: Site, streams: list[SensorStream]) -> None:
         self.site, self.streams = site, streams
         self.imu = InertialStream(site.platform.imu.time_offset)
-        self.fields, self.steady, self.others = [], {}, OtherMeasurements()
+        self.fields, self.static, self.others = [], {}, OtherMeasurements()
         self.last_epoch, self.open_signs = -np.inf, 0
         self.short, self.without = None, Counter()
         self._detection, self._still = DetectionFilter(), StillSamples()
@@ -117,18 +117,18 @@ class Arrivals(ABC):
     def add_slots(self, time: Array, slot: IntArray) -> None:
         """Add the slots of samples, as `Navigator.add_slots`."""
 
-    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
+    def add_fields(self, samples: FieldSamples, static: StaticFields | None, after: float) -> int:
         """Add phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
         samples = sensor_frame_phasors(self.site, samples)
         check_clock("fields", samples.time, self.newest)
-        late = self._add_epochs(samples, steady, after)
+        late = self._add_epochs(samples, static, after)
         self.fields.sort(key=lambda s: float(s.time[0]))
         received = np.append([s.time[0] for s in self.fields], samples.time)
         self._stand_still(np.unique(received), raw=False)
         return late
 
     @abstractmethod
-    def _add_epochs(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
+    def _add_epochs(self, samples: FieldSamples, static: StaticFields | None, after: float) -> int:
         """Add phasors on the log's clock; return how many are not after a time (s)."""
 
     def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
@@ -239,7 +239,7 @@ class Arrivals(ABC):
         time = start.state.time
         self.imu.begin(start.state)
         self.fields = [s for s in self.fields if s.time[0] > time]
-        self.steady = {t: s for t, s in self.steady.items() if t > time}
+        self.static = {t: s for t, s in self.static.items() if t > time}
         self.others.drop_until(time)
         self.last_epoch = time
         self._begin_receivers(start, delay)
@@ -304,28 +304,28 @@ class Arrivals(ABC):
         """
         time = predicted.time
         self.without.update(self._silent())
-        by_offset, steady = None, self.steady.pop(time, None)
+        by_offset, static = None, self.static.pop(time, None)
         if samples is None:
             if self.short is not None and self.short.at(time):
                 return self._measured_together(self.short, before, predicted, standing=standing)
             wave = self._demodulated(before, predicted, is_lost=is_lost)
             if wave is None:
                 return None  # only the clock went on
-            samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
+            samples, static, by_offset = wave.fields, wave.static, wave.by_time_offset
         own = step if not samples.magnetometers else self._own_step(samples)
         samples = self._detection.of(samples, own)
         if not samples.signed:
             here, result = as_trajectory([predicted]), samples
             samples = with_signs(samples, here, predicted.calibration)
             self.open_signs += count_open(result, samples)
-        if not np.any(samples.valid) and not (earth and steady is not None):
+        if not np.any(samples.valid) and not (earth and static is not None):
             return None
         self.last_epoch = time
         repeats = max(1.0, float(samples.window[0]) / own)
         return measurements_of_fields(
             predicted,
             samples,
-            steady,
+            static,
             self.imu,
             step,
             repeats,

@@ -16,7 +16,7 @@ from magfusion.estimation.measurements.relative_pose import RelativePose
 from magfusion.estimation.measurements.zero_velocity import REACH, may_stand, quiet_before
 from magfusion.estimation.online.queue.inertial_stream import InertialStream
 from magfusion.model.parameters import Block, corrected_imu
-from magfusion.model.samples import FieldSamples, SteadyFields
+from magfusion.model.samples import FieldSamples, StaticFields
 from magfusion.model.site import Site
 from magfusion.units import ComplexArray
 
@@ -29,7 +29,7 @@ class EpochMeasurements:
     samples: FieldSamples
     phasors: FieldPhasors | JointPhasors  # the phasors as a measurement
     earth: EarthField | None  # the static field as a measurement, if it is one
-    steady: SteadyFields | None  # the measured static field, where there is a waveform
+    static: StaticFields | None  # the measured static field, where there is a waveform
     repeats: float  # number of epochs that contain each sample of overlapping windows
 
     @property
@@ -47,7 +47,7 @@ class EpochMeasurements:
 def measurements_of_fields(
     predicted: State,
     samples: FieldSamples,
-    steady: SteadyFields | None,
+    static: StaticFields | None,
     imu: InertialStream,
     step: float,
     repeats: float,
@@ -87,9 +87,9 @@ def measurements_of_fields(
         np.array([standing]),
     )
     field = None
-    if earth and steady is not None:
-        field = earth_measurement(site, steady, now, rate_body, offset, step)
-    return EpochMeasurements(samples, phasors, field, steady, repeats)
+    if earth and static is not None:
+        field = earth_measurement(site, static, now, rate_body, offset, step)
+    return EpochMeasurements(samples, phasors, field, static, repeats)
 
 
 def with_inertial(

@@ -22,7 +22,7 @@ from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.parameters import seen_by
-from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, StaticFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.lockin_receiver import LockinReceiver
@@ -88,7 +88,7 @@ class SeveralArrivals(Arrivals):
     def _add_epochs(
         self,
         samples: FieldSamples,
-        steady: SteadyFields | None,  # noqa: ARG002
+        static: StaticFields | None,  # noqa: ARG002
         after: float,
     ) -> int:
         """Add phasors on the log's clock; those of equal times are merged."""

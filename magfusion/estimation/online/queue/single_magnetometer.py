@@ -14,7 +14,7 @@ from magfusion.estimation.online.queue.arrivals import MARGIN, Arrivals
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.estimation.online.queue.short_windows import ShortWindows
 from magfusion.files.named_records import magnetometer_number
-from magfusion.model.samples import FieldSamples, SteadyFields
+from magfusion.model.samples import FieldSamples, StaticFields
 from magfusion.model.site import Site
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.receivers import receiver_of
@@ -47,7 +47,7 @@ class SingleArrivals(Arrivals):
         check_clock("magnetometer", time, self.newest)
         self.receiver.add_slots(time, slot)
 
-    def _add_epochs(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
+    def _add_epochs(self, samples: FieldSamples, static: StaticFields | None, after: float) -> int:
         if self.fields and self.fields[-1].signed != samples.signed:
             raise InputError(
                 "fields: amplitudes without sign are mixed with phasors; use only one of them"
@@ -59,8 +59,8 @@ class SingleArrivals(Arrivals):
                 late += 1
                 continue
             self.fields.append(one)
-            if steady is not None:
-                self.steady[float(one.time[0])] = steady.rows(slice(i, i + 1))
+            if static is not None:
+                self.static[float(one.time[0])] = static.rows(slice(i, i + 1))
         return late
 
     # Times
@@ -114,7 +114,7 @@ class SingleArrivals(Arrivals):
             self.imu.measured(end=until - self.imu.offset + MARGIN),
             self.stream.samples,
             self.fields,
-            list(self.steady.values()),
+            list(self.static.values()),
             until,
             settings,
             self.receiver.marks,

@@ -27,7 +27,7 @@ MOST_OF_WINDOW = 0.5  # that may pass without a sample, however long intervals a
 
 
 @dataclass(frozen=True, eq=False)
-class SteadyField:
+class StaticField:
     """Readings averaged over windows."""
 
     time: Array  # (n,), centre of each window, on the log's clock (s)
@@ -54,9 +54,9 @@ def window_length(site: Site) -> float:
     return length
 
 
-def steady_field(
+def static_field(
     waveform: Waveform, imu: ImuSamples, site: Site, *, magnetometer: Magnetometer | None = None
-) -> SteadyField:
+) -> StaticField:
     """Average a waveform over consecutive windows.
 
     `magnetometer`: the current calibration; by default the site's. Raises InputError where no
@@ -72,7 +72,7 @@ def steady_field(
     return average(waveform, imu, offset, known, centre, window)
 
 
-def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
+def static_alone(waveform: Waveform, site: Site) -> StaticField:
     """Average a waveform without a gyro, over windows that are as short as possible.
 
     Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is too
@@ -97,7 +97,7 @@ def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     far = float(np.linalg.norm(np.ptp(mean, axis=0)))
     slow = rate * length < MIN_TURN_CHANGE * far
     centre, window, mean = centre[slow], window[slow], mean[slow]
-    return SteadyField(centre, window, mean, np.zeros_like(mean))
+    return StaticField(centre, window, mean, np.zeros_like(mean))
 
 
 def average(
@@ -107,7 +107,7 @@ def average(
     magnetometer: Magnetometer,
     centre: Array,
     window: Array,
-) -> SteadyField:
+) -> StaticField:
     """Average waveform and specific force over given windows, without those that have a gap.
 
     `time_offset`: added to the IMU's stamps (s). `magnetometer`: calibration for the rotation of
@@ -129,7 +129,7 @@ def average(
     field = _turned_means(waveform.time, centred, at_samples, at_centre, centre, window)
     accel = _turned_means(imu_time, imu.accel_body, attitude, at_centre, centre, window)
     measured = field @ np.linalg.inv(body_from_measured).T + magnetometer.offset
-    return SteadyField(centre, window, measured, accel)
+    return StaticField(centre, window, measured, accel)
 
 
 def _turned_means(

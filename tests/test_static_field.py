@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import smooth
-from magfusion.estimation.data_checks.steady_field import off_earth
+from magfusion.estimation.data_checks.static_field import off_earth
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
