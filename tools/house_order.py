@@ -84,7 +84,7 @@ ROOMS = {
         """,
         "calibration": """
             allan antenna beacon bench_response fieldmap graph magnetometer marked_snapshots
-            steady_field stops
+            static_field stops
             installation
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest turn_coverage
