@@ -61,6 +61,24 @@ def test_a_log_is_corrected_once_and_again_by_another_site() -> None:
     np.testing.assert_array_equal(as_recorded(once).imu.accel_body, recorded.imu.accel_body)
 
 
+def test_stamps_of_a_single_magnetometer_are_moved_once_and_back() -> None:
+    wave = Waveform(np.linspace(0.0, 100.0, 11), np.zeros((11, 3)))
+    log = Log("late", 0, "simulated", SMALL.log.imu, wave)
+    sensor = replace(SMALL.site.platform.magnetometer, clock_offset=-0.05, clock_rate=1e-4)
+    site = replace(SMALL.site, platform=replace(SMALL.site.platform, magnetometer=sensor))
+    once, _ = logged(log, site)
+    twice, _ = logged(once, site)
+    assert once.waveform is not None
+    assert twice.waveform is not None
+    expected = 1.0001 * wave.time - 0.05
+    np.testing.assert_allclose(once.waveform.time, expected, rtol=1e-12)
+    np.testing.assert_array_equal(twice.waveform.time, once.waveform.time)
+    np.testing.assert_allclose(site.platform.on_drive_clock(wave.time), expected, rtol=1e-12)
+    recorded = as_recorded(once).waveform
+    assert recorded is not None
+    np.testing.assert_allclose(recorded.time, wave.time, rtol=0.0, atol=1e-9)
+
+
 def test_a_clock_that_is_fast_is_slowed_once() -> None:
     time = np.linspace(0.0, 100.0, 11)
     wave = Waveform(1.0002 * time, np.zeros((11, 3)))  # stamps run 200 ppm fast

@@ -125,6 +125,8 @@ def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
     [
         ("ekf", ("accel_bias", "gyro_deg_s", "gyro_x_sign", "magnetometer_clock_20ppm")),
         ("smooth", ("gyro_bias", "gyro_sign", "survey_ned", "survey_tilted_5deg")),
+        ("smooth", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
+        ("ekf", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
     ],
 )
 def test_units_signs_biases_and_frames_are_undone_and_their_remedies_work(

@@ -149,9 +149,10 @@ def _check_single(one: MagnetometerEntry | None) -> None:
     if one is None:
         detail = InitErrorDetails(type="missing", loc=("magnetometer",), input=None)
         raise ValidationError.from_exception_data("site", [detail])
-    if one.clock_offset_s or one.sigma.clock_offset_s:
-        remedy = "remove it: the clock of a single magnetometer is that of the log"
-        raise refusal_at(("magnetometer", "clock_offset_s"), one.clock_offset_s, remedy)
+    if one.sigma.clock_offset_s:
+        remedy = "declare imu.time_offset_sigma_s: a single magnetometer has the log's clock"
+        at = ("magnetometer", "sigma", "clock_offset_s")
+        raise refusal_at(at, one.sigma.clock_offset_s, remedy)
 
 
 def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int, ...]) -> None:

@@ -47,7 +47,8 @@ class Magnetometer:
     axes: str = "xyz"  # names of its axes
     casing: Casing | None = None  # steel tube around it
     name: str = "magnetometer"  # identifies it in data and reports where there are several
-    # a sample stamped t was taken at t + clock_offset on the log's clock (s)
+    # a sample stamped t was taken at t + clock_offset on the log's clock, which is that of the
+    # first of several and of the drives (s)
     clock_offset: float = 0.0
     # of a single magnetometer: a sample stamped t was taken at t (1 + clock_rate) on the clock of
     # the drives

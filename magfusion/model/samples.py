@@ -309,6 +309,7 @@ class Log:
     waveforms: Mapping[str, Waveform] = field(default_factory=dict)
     recorded_imu: ImuSamples | None = None
     clock_rate: float = 0.0
+    clock_offset: float = 0.0
     aiding: Mapping[str, AidingSamples] = field(default_factory=dict)
 
     @property

@@ -92,8 +92,13 @@ class Platform:
 
     def on_drive_clock(self, time: Array) -> Array:
         """Return stamps of the magnetometer on the clock of the drives (s)."""
-        rate = self.magnetometer.clock_rate
-        return time if rate == 0.0 else time * (1.0 + rate)
+        rate, offset = self.log_clock
+        return time if rate == offset == 0.0 else time * (1.0 + rate) + offset
+
+    @property
+    def log_clock(self) -> tuple[float, float]:
+        """Rate and offset (s) of the drives' clock relative to the only magnetometer's stamps."""
+        return self.magnetometer.clock_rate, self.magnetometer.clock_offset
 
     def with_magnetometers(self, magnetometers: tuple[Magnetometer, ...]) -> "Platform":
         """Return the platform with other magnetometers."""

@@ -104,10 +104,10 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
     """Return a log and its site as the estimators use them.
 
     As `without_imu` if the log has no inertial samples; otherwise these are corrected by the
-    declared `ImuIntrinsics`.  The magnetometer's stamps are corrected by the declared rate of its
-    clock.  A corrected log can be corrected again, by the same or another site.
+    declared `ImuIntrinsics`.  The magnetometer's stamps are corrected by the declared rate and
+    offset of its clock.  A corrected log can be corrected again, by the same or another site.
     """
-    log = _at_clock_rate(log, site.platform.magnetometer.clock_rate)
+    log = _on_clock(log, *site.platform.log_clock)
     if site.platform.magnetometer.ac_coupled and log.waveform is not None:
         log = replace(log, waveform=replace(log.waveform, ac_coupled=True))
     if not len(log.imu):
@@ -121,19 +121,20 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
 
 def as_recorded(log: Log) -> Log:
     """Return a log with its samples and stamps as recorded."""
-    log = _at_clock_rate(log, 0.0)
+    log = _on_clock(log, 0.0, 0.0)
     recorded = log.imu if log.recorded_imu is None else log.recorded_imu
     return replace(log, imu=recorded, recorded_imu=None)
 
 
-def _at_clock_rate(log: Log, rate: float) -> Log:
-    """Return a log whose magnetometer's stamps are corrected by a rate of its clock."""
+def _on_clock(log: Log, rate: float, offset: float) -> Log:
+    """Return a log whose magnetometer's stamps are corrected by a rate and an offset (s)."""
     wave = log.waveform
-    if wave is None or rate == log.clock_rate:
+    if wave is None or (rate, offset) == (log.clock_rate, log.clock_offset):
         return log
-    time = wave.time * ((1.0 + rate) / (1.0 + log.clock_rate))
+    time = (wave.time - log.clock_offset) * ((1.0 + rate) / (1.0 + log.clock_rate)) + offset
     marks = None if wave.marks is None else wave.marks.on_clock(wave.time, time)
-    return replace(log, waveform=replace(wave, time=time, marks=marks), clock_rate=rate)
+    wave = replace(wave, time=time, marks=marks)
+    return replace(log, waveform=wave, clock_rate=rate, clock_offset=offset)
 
 
 def require_motion_prior(site: Site) -> None:

@@ -33,8 +33,8 @@ def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
     waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
     if waves and len(kept) == 1:  # on the log's clock, as a log of a single magnetometer
         wave = waves[sensors[0].name]
-        wave = replace(wave, time=wave.time + sensors[0].clock_offset)
-        return replace(log, fields=None, waveform=wave, waveforms={}), residual
+        log = replace(log, fields=None, waveform=wave, waveforms={})
+        return replace(log, clock_rate=0.0, clock_offset=0.0), residual
     return replace(log, fields=fields, waveforms=waves), residual
 
 

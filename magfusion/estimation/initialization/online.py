@@ -133,6 +133,7 @@ def find_online_start(
         imu=imu,
         recorded_imu=_recorded(site, imu),
         clock_rate=site.platform.magnetometer.clock_rate,
+        clock_offset=site.platform.magnetometer.clock_offset,
         waveform=None if fields or several else wave.rows(wave.time <= until),
         fields=FieldSamples.joined(whole) if whole else None,
         static=_joined_static(static, whole) if whole and static else None,

@@ -1,6 +1,6 @@
 """Sites in which a mistake is undone."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -215,10 +215,15 @@ def _moved(site: Site, block: Block, step: Array) -> Site:
     if parameter in _OF_IMU:
         return _OF_IMU[parameter](site, step)
     if parameter == PHASE:
-        beacons = tuple(_in_phase(b, step) if b.name == owner else b for b in site.beacons)
-        return replace(site, beacons=beacons)
+        return with_phases(site, {owner: step})
     moved = parameter.moved(initial_calibration(site, 0.0), owner, step)
     return parameter.refined(moved.site, moved, owner, parameter.sigma(site, owner))
+
+
+def with_phases(site: Site, steps: Mapping[str, Array]) -> Site:
+    """Return a site with steps (rad) of the drive phase of each tone of some beacons, by name."""
+    beacons = (_in_phase(b, steps[b.name]) if b.name in steps else b for b in site.beacons)
+    return replace(site, beacons=tuple(beacons))
 
 
 def _in_phase(beacon: Beacon, step: Array) -> Beacon:

@@ -1,20 +1,20 @@
 """Faults of clocks and drive phases: each epoch's phases are estimated with its pose."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from magfusion.estimation.integrity.corrected_site import with_magnetometer
+from magfusion.estimation.integrity.corrected_site import with_magnetometer, with_phases
 from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
 from magfusion.estimation.integrity.field_causes import left_handed
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.solve.bounded import minimise_between
 from magfusion.model.samples import FieldSamples
-from magfusion.model.site import Beacon
+from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
 
 TWO_PI = 2.0 * np.pi
@@ -51,9 +51,10 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
             yield from clocks
             return
     shift = _shift(mean, tones_hz)
-    shifted = _rotated(known, -TWO_PI * tones_hz * shift)
+    turn = -TWO_PI * tones_hz * shift
+    shifted = _rotated(known, turn)
     side = "late" if shift > 0.0 else "early"
-    yield _explanation(
+    by_shift = _explanation(
         known,
         shifted,
         1,
@@ -63,20 +64,34 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
         "Correct epoch_ns of the log (of a bag or EuRoC folder by magfusion import --epoch NS), or"
         " the delay of the magnetometer's stamps.",
     )
+    yield replace(by_shift, site=_in_phase(known, turn), rival=_late(by_shift, known.site, shift))
     if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
         yield _explanation(known, _rotated(known, np.full(len(mean), np.pi)), 0, *left_handed())
     elif (
         not _wired(known, mean) and constant.chi_square < SIMILAR * shifted.chi_square - LEAST_FALL
     ):
-        yield _explanation(
-            known,
-            constant,
-            len(mean),
-            "phase",
-            f"the drive phases are ({', '.join(f'{m:.3g}' for m in mean / DEGREE)}) degrees beyond"
-            " the declared",
-            "Check phase_deg, or declare synchronised: false for the beacons.",
-        )
+        yield _of_each(known, constant, mean)
+
+
+def _of_each(known: Snapshots, constant: Snapshots, phase: Array) -> Explanation:
+    """Return what phases (rad) of the channels explain that no shift of the epoch does.
+
+    A short part of a log does not distinguish constant phases from clocks of their own.
+    """
+    every = [name for name, _ in known.samples.channels]
+    names = {n for n, off in zip(every, np.abs(phase) > REVERSED, strict=True) if off}
+    is_one = len(names) < 2
+    amounts = ", ".join(f"{one:.3g}" for one in phase / DEGREE)
+    result = _explanation(
+        known,
+        constant,
+        len(phase),
+        "phase" if is_one else "beacon_clock",
+        f"the drive phases are ({amounts}) degrees beyond the declared"
+        + ("" if is_one else ": the drives have no common clock"),
+        "Check phase_deg, or declare synchronised: false for the beacons.",
+    )
+    return replace(result, site=_free_running(known.site, dict.fromkeys(names or every, 0.0)))
 
 
 def _wired(known: Snapshots, phase: Array) -> bool:
@@ -92,6 +107,31 @@ def _explanation(
     return Explanation(
         code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, count
     )
+
+
+def _late(by_shift: Explanation, site: Site, shift: float) -> Explanation | None:
+    """Return the delay of the magnetometer alone that shifts the phases; None without an IMU."""
+    if site.platform.further or not site.platform.inertial:
+        return None
+    side = "late" if shift > 0.0 else "early"
+    offset = site.platform.magnetometer.clock_offset - shift
+    return replace(
+        by_shift,
+        cause=f"the magnetometer's stamps are {1e3 * abs(shift):.3g} ms {side} against the IMU and"
+        " the drive phases",
+        remedy="Correct the delay of the magnetometer's stamps, or declare its clock_offset_s.",
+        site=with_magnetometer(site, clock_offset=offset),
+    )
+
+
+def _in_phase(known: Snapshots, phase: Array) -> Site | None:
+    """Return a site with phases (rad) of its channels added; None where one is unknown."""
+    steps: dict[str, list[float]] = {}
+    for (name, _), step in zip(known.samples.channels, phase.tolist(), strict=True):
+        steps.setdefault(name, []).append(step)
+    if not np.all(np.isfinite(phase)):
+        return None
+    return with_phases(known.site, {name: np.array(step) for name, step in steps.items()})
 
 
 def _rotated(known: Snapshots, turn: Array) -> Snapshots:
@@ -150,12 +190,32 @@ def _of_clocks(
         beacon, k = strays[0], names.index(strays[0])
         cause = f"beacon {strays[0]} runs at {tones_hz[k] * (1.0 + rate[k]):.6g} Hz"
         remedy = "Correct its frequency_hz, or declare synchronised: false."
+        site = _free_running(known.site, {beacon: float(rate[k])})
     else:
         code, count = "beacon_clock", 2 * len(rate)
         cause = "the drives run on clocks of their own"
         remedy = "Declare synchronised: false for the beacons."
+        site = _free_running(known.site, dict.fromkeys(names, 0.0))
     explained = known.chi_square, tried.chi_square, known.freedom
     yield Explanation(code, cause, remedy, *explained, count, beacon, site=site)
+
+
+def _free_running(site: Site, rates: Mapping[str, float]) -> Site:
+    """Return a site with beacons on clocks of their own, at relative rates, by name."""
+
+    def on_own_clock(beacon: Beacon) -> Beacon:
+        faster = 1.0 + rates[beacon.name]
+        coils = (
+            coil
+            if coil.frequency_hz is None
+            else replace(coil, frequency_hz=faster * coil.frequency_hz)
+            for coil in beacon.coils
+        )
+        frequency_hz = faster * beacon.frequency_hz
+        return replace(beacon, synchronised=False, frequency_hz=frequency_hz, coils=tuple(coils))
+
+    beacons = (on_own_clock(beacon) if beacon.name in rates else beacon for beacon in site.beacons)
+    return replace(site, beacons=tuple(beacons))
 
 
 def _shift(phase: Array, tones_hz: Array) -> float:
