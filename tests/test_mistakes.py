@@ -127,6 +127,8 @@ def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
         ("smooth", ("gyro_bias", "gyro_sign", "survey_ned", "survey_tilted_5deg")),
         ("smooth", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
         ("ekf", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
+        ("smooth", ("magnetometer_xy_swapped", "magnetometer_z_sign")),
+        ("ekf", ("magnetometer_xy_swapped", "magnetometer_z_sign")),
     ],
 )
 def test_units_signs_biases_and_frames_are_undone_and_their_remedies_work(

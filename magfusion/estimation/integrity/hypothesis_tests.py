@@ -17,6 +17,7 @@ from magfusion.estimation.integrity.beacon_causes import (
     matrix_causes,
     survey_causes,
 )
+from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import ENOUGH, Explanation, clearly_best
 from magfusion.estimation.integrity.field_causes import global_causes
 from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
@@ -25,10 +26,12 @@ from magfusion.estimation.integrity.motion_causes import (
     gyro_unit_causes,
     motion_causes,
     timing_causes,
+    with_quarter_turn,
 )
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.phase_causes import phase_causes
 from magfusion.model.noise import model_error
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.without_imu import logged
@@ -42,7 +45,7 @@ PARTS = 4
 MIN_EPOCHS = 8  # epochs
 LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
-QUANTISED = "quantised"  # code
+QUANTISED, LEFT_HANDED = "quantised", "magnetometer_axes"  # codes
 DISTORTION = 0.3  # of a step, in phasors: 1/sqrt(12) of each sample
 STRANGE = 1e3  # and above which it is no field of this site
 
@@ -72,6 +75,8 @@ def cause_of(
         of_motion = clearly_best(_of_motion(known, samples, part.imu))
     if of_motion is not None and (of_fields is None or of_motion.fall > of_fields.fall):
         return of_motion, of_motion.text(OF_MOTION)
+    if of_fields is not None and of_fields.code == LEFT_HANDED:
+        of_fields = replace(of_fields, site=_with_right_axes(samples, part.imu, site))
     if of_fields is not None:
         return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
     return None
@@ -202,6 +207,19 @@ def _of_motion(known: Snapshots, samples: FieldSamples, imu: ImuSamples) -> list
         *gyro_unit_causes(every, imu, site, before, motion.freedom),
         *timing_causes(every, imu, site, before, motion.freedom),
     ]
+
+
+def _with_right_axes(samples: FieldSamples, imu: ImuSamples, site: Site) -> Site | None:
+    """Return a site with the axes of a left-handed magnetometer; None where motion has none.
+
+    The fields determine its handedness, the motion which of the axes are reversed or exchanged.
+    """
+    if site.platform.further or not site.platform.inertial:
+        return None
+    reversed_axes = with_magnetometer(site, matrix=-site.platform.magnetometer.matrix)
+    every = surveyed(samples, initial_calibration(reversed_axes, float(np.mean(samples.time))))
+    motion = compared(every, imu, reversed_axes)
+    return None if motion is None else with_quarter_turn(motion, reversed_axes)
 
 
 def _part(log: Log) -> Log:

@@ -14,7 +14,7 @@ from magfusion.estimation.integrity.corrected_site import (
     with_intrinsics,
     with_magnetometer,
 )
-from magfusion.estimation.integrity.explanation import Explanation
+from magfusion.estimation.integrity.explanation import CLEARLY, Explanation
 from magfusion.estimation.integrity.fault_candidates import LARGEST
 from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
 from magfusion.estimation.snapshot.fix import Fixes
@@ -116,6 +116,22 @@ def _rotated_axes(known: Compared, before: float, site: Site) -> Iterator[Explan
         )
         yield replace(mounted, rival=rotated)
         yield replace(rotated, rival=mounted)
+
+
+def with_quarter_turn(known: Compared, site: Site) -> Site | None:
+    """Return a site with its magnetometer's axes turned as the motion requires, by its matrix.
+
+    None where no signed permutation explains the motion clearly better than the others.
+    """
+    sensor = site.platform.magnetometer
+    lever, mounting = sensor.position_body, sensor.body_from_sensor
+    turns = [axes for axes in _signed_permutations() if np.linalg.det(axes) > 0.0]
+    costs = [known.explained(axes, axes, lever=lever - axes @ lever)[0] for axes in turns]
+    first, second = np.argsort(costs)[:2]
+    if costs[second] < CLEARLY * costs[first]:
+        return None
+    turn = mounting.T @ turns[first] @ mounting
+    return with_magnetometer(site, matrix=sensor.matrix @ turn)
 
 
 def _released(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
