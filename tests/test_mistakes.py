@@ -127,7 +127,7 @@ def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
         ("smooth", ("gyro_bias", "gyro_sign", "survey_ned", "survey_tilted_5deg")),
         ("smooth", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
         ("ekf", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
-        ("smooth", ("magnetometer_xy_swapped", "magnetometer_z_sign")),
+        ("smooth", ("magnetometer_xy_swapped", "magnetometer_z_sign", "imu_clock_1000ppm")),
         ("ekf", ("magnetometer_xy_swapped", "magnetometer_z_sign")),
     ],
 )

@@ -38,6 +38,7 @@ ACCEL_UNITS = {
     "in mm/s^2": 1e-3,
 }
 MAX_DELAY = 3.0  # s
+LARGEST_DRIFT = 0.1  # s, that two streams drift apart; a window is a few tenths long
 PARTS = 4  # of a log, in each of which a delay is sought
 DOUBT_SIGMAS = 3.0  # sigmas of a declared time offset
 EYE = np.eye(3)
@@ -353,7 +354,24 @@ def timing_causes(
             after * freedom / again.freedom,
             freedom,
             2,
+            site=_on_clock(site, imu.time, rate, start),
         )
+
+
+def _on_clock(site: Site, stamps: Array, rate: float, start: float) -> Site | None:
+    """Return a site whose inertial stamps are late by ``start + rate * t``; None where too much.
+
+    Of the streams, only the constant part of a declared offset is corrected.
+    """
+    if abs(rate) * (stamps[-1] - stamps[0]) > LARGEST_DRIFT:
+        return None
+    clock = site.platform.imu
+    late = (start + rate * (stamps[0] + clock.time_offset)) / (1.0 + rate)
+    return with_imu(
+        site,
+        time_offset=clock.time_offset - late,
+        clock_rate=(1.0 + clock.clock_rate) / (1.0 + rate) - 1.0,
+    )
 
 
 def _delay(fixes: Fixes, imu: ImuSamples, site: Site, part: slice) -> tuple[float, float]:
