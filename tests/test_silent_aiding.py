@@ -1,13 +1,18 @@
 """Aiding sensors of the site of which a log, or a part of it, has no samples."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from aiding_site import aided_site
 
+from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.data_checks.stamps import silent_aiding
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.replay import Replay
 from magfusion.model.aiding import AidingSamples, AidingSensor
 from magfusion.model.samples import ImuSamples, Log
@@ -67,3 +72,11 @@ def test_the_check_of_a_recording_names_it() -> None:
 
 def test_a_sensor_of_another_clock_does_not_lengthen_the_replay() -> None:
     assert len(Replay(_log(EVERY + OTHER_EPOCH))) == len(Replay(_log(None)))
+
+
+def test_check_refuses_a_sensor_that_the_site_lacks(tmp_path: Path) -> None:
+    log = simulate_log(aided_site(LEVEL), SimulationConfig(ROOM, 2.0), np.random.default_rng(1)).log
+    write_log(log, tmp_path / "log")
+    save_site(aided_site(replace(LEVEL, name="level_1")), tmp_path / "log" / "site.yaml")
+    with pytest.raises(InputError, match="level is no aiding sensor of the site"):
+        run_check(CheckSettings(log=tmp_path / "log"))
