@@ -42,8 +42,9 @@ def run_check(
     from magfusion.estimation.demodulation.separate_demodulation import by_name, each_recorded
     from magfusion.estimation.integrity.quick_check import quick_check
     from magfusion.files.site import site_tables
-    from magfusion.jobs.inputs import read_recording
+    from magfusion.jobs.inputs import named, read_recording
     from magfusion.jobs.result_directory import claim, found_in
+    from magfusion.model.aiding import check_declared
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
 
@@ -56,6 +57,9 @@ def run_check(
     began = time.perf_counter()
     report("reading", 0, 3)
     log, site = read_recording(job, report)
+    if site is not None:
+        with named(job.log_path):
+            check_declared(site.aiding, log.aiding)
     report("checking", 1, 3)
     lockin = None if site is None or not site.beacons else settings.lockin(job)
     if log.waveforms and settings.correct is not None:

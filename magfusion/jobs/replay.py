@@ -66,7 +66,8 @@ class Packet:
 class Replay:
     """The pieces of a log.
 
-    `log`: a phasor arrives when its window ends.
+    `log`: a phasor arrives when its window ends. Samples of aiding sensors outside the others are
+    omitted.
     """
 
     def __init__(self, log: Log) -> None:
@@ -75,7 +76,6 @@ class Replay:
         streams = [log.imu.time, self._field_arrival]
         streams += [] if log.waveform is None else [log.waveform.time]
         streams += [wave.time for wave in log.waveforms.values()]
-        streams += [samples.time for samples in log.aiding.values()]
         known = [s for s in streams if len(s)]
         first = min(float(s[0]) for s in known)
         last = max(float(s[-1]) for s in known)

@@ -155,3 +155,18 @@ def sensor_named(
             " correct one of them"
         )
     return known[name]
+
+
+def check_declared(sensors: tuple[AidingSensor, ...], aiding: Mapping[str, AidingSamples]) -> None:
+    """Raise InputError if samples are of a sensor, a quantity or a mark that the site lacks."""
+    for name, samples in aiding.items():
+        check_marks(sensor_named(sensors, name, samples.quantity), samples)
+
+
+def check_marks(sensor: AidingSensor, samples: AidingSamples) -> None:
+    """Raise InputError if samples are on a mark that the site lacks."""
+    unknown = sorted(set(samples.marks) - set(sensor.marks_world))
+    if unknown:
+        raise InputError(
+            f"{sensor.name}: {unknown[0]} is no mark of the site; add it to aiding.marks_m"
+        )

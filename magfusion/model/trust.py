@@ -26,6 +26,7 @@ CODES = {
     "aiding_mounting": "an aiding sensor is not mounted as declared",
     "aiding_offset": "the offset of an aiding sensor is not as declared",
     "aiding_scale": "the scale of an aiding sensor is not as declared",
+    "aiding_silent": "an aiding sensor has no samples in the log or a part of it",
     "ambiguous": "another pose, or position of a beacon, explains the measurements nearly as well",
     "angle_convention": "the attitudes of beacons follow another convention",
     "angle_units": "the attitudes of beacons are in another unit",

@@ -25,7 +25,7 @@ from magfusion.estimation.data_checks.signal import (
     undetected_findings,
     with_motion_compensation,
 )
-from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.data_checks.stamps import silent_aiding, uneven_stamps
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.model.aiding import OF_MOTION
@@ -47,6 +47,7 @@ SAMPLE_TESTS: tuple[SampleTest, ...] = (
     false_samples,
     noisy_inertial,
     range_step,
+    silent_aiding,
 )
 LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
 MOUNTED = 0.1  # rad; largest sigma of a mounting that is known

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.aiding import AidingSamples, AidingSensor
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import LISTED, Finding, Verdict
@@ -22,6 +23,10 @@ MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
 MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
 MIN_LOST_SHARE = 1e-3  # that is no error of its rate
+# Of aiding sensors: beyond it the position by an IMU alone is off by decimetres.
+LONGEST_SILENCE = 5.0  # s
+LONGEST_SILENCE_STEPS = 20.0  # medians between two samples, where the sensor is slower than that
+MIN_SAMPLES = 20  # of which the usual step is known
 
 
 class Timing(NamedTuple):
@@ -202,3 +207,54 @@ def _overlap_findings(imu: Timing, field: Timing) -> Iterator[Finding]:
             " One was started late, or their clocks differ. Stamp both with one clock.",
             weight=longest / max(common, 0.1 * longest),
         )
+
+
+def silent_aiding(log: Log, site: Site | None) -> Iterator[Finding]:
+    """Yield a remark for each aiding sensor without samples for long, or at all."""
+    if site is None or not site.aiding:
+        return
+    begin, end = _span(log)
+    for sensor in site.aiding:
+        samples = log.aiding.get(sensor.name)
+        if samples is None or not len(samples):
+            yield _remark(
+                f"{sensor.name} of the site's aiding has no samples from {begin:.1f} to {end:.1f} s"
+                f" and is not used. Check the table or topic ({sensor.quantity}) and the name of"
+                " the sensor in it."
+            )
+        else:
+            yield from _gaps(sensor, samples, begin, end)
+
+
+def _gaps(
+    sensor: AidingSensor, samples: AidingSamples, begin: float, end: float
+) -> Iterator[Finding]:
+    """Yield a remark on the parts without samples of a sensor that has some."""
+    time = samples.time + float(sensor.time_offset)
+    inside = time[(time >= begin) & (time <= end)]
+    if not len(inside):
+        yield _remark(
+            f"The samples of {sensor.name}, from {time[0]:.1f} to {time[-1]:.1f} s, are outside the"
+            f" log ({begin:.1f} to {end:.1f} s) and not used. Check the clock of its stamps, or"
+            " correct time_offset_s."
+        )
+    elif sensor.quantity != "mark" and len(inside) >= MIN_SAMPLES:
+        edges = np.concatenate([[begin], inside, [end]])
+        longest = max(LONGEST_SILENCE, LONGEST_SILENCE_STEPS * float(np.median(np.diff(inside))))
+        first = np.flatnonzero(np.diff(edges) > longest)
+        parts = [f"{edges[i]:.1f} to {edges[i + 1]:.1f} s" for i in first[:LISTED]]
+        if parts:
+            more = f" and {len(first) - LISTED} more times" if len(first) > LISTED else ""
+            yield _remark(f"{sensor.name} has no samples from {', '.join(parts)}{more}.")
+
+
+def _span(log: Log) -> tuple[float, float]:
+    """Return the first and last time of the inertial samples and fields (s)."""
+    streams: list[Array] = [log.imu.time, *(wave.time for wave in log.waveforms.values())]
+    streams += [stream.time for stream in (log.waveform, log.fields) if stream is not None]
+    ends = [(float(time[0]), float(time[-1])) for time in streams if len(time)]
+    return min(first for first, _ in ends), max(last for _, last in ends)
+
+
+def _remark(sentence: str) -> Finding:
+    return Finding("aiding_silent", sentence, Verdict.TRUSTWORTHY)

@@ -18,6 +18,7 @@ from magfusion.model.aiding import (
     AidingSamples,
     AidingSensor,
     Quantity,
+    check_marks,
     sensor_named,
 )
 from magfusion.model.samples import ImuSamples
@@ -121,9 +122,5 @@ def _has_inertial(
 
 
 def _on_marks(sensor: AidingSensor, samples: AidingSamples) -> Array:
-    unknown = sorted(set(samples.marks) - set(sensor.marks_world))
-    if unknown:
-        raise InputError(
-            f"{sensor.name}: {unknown[0]} is no mark of the site; add it to aiding.marks_m"
-        )
+    check_marks(sensor, samples)
     return np.array([sensor.marks_world[mark] for mark in samples.marks]).reshape(-1, 3)

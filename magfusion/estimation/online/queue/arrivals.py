@@ -41,6 +41,7 @@ from magfusion.units import Array, IntArray
 LONGEST_WAIT = 5.0  # s; fields are processed without an IMU that is silent for longer
 SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
 MARGIN = 0.1  # s; of inertial samples about a window
+LONGEST_RECORD = 0.1  # s; of samples that arrive together, twice what a replay sends at once
 
 
 class Arrivals(ABC):
@@ -55,6 +56,8 @@ class Arrivals(ABC):
     static: dict[float, StaticFields]  # by the time of the epoch (s), its static fields
     others: OtherMeasurements
     last_epoch: float  # time of the last fields (s)
+    # time after which phasors have arrived, or are awaited only by the delay (s); 0 before any
+    fields_latency: float
     # of tones that are close, where one magnetometer measures them together
     short: ShortWindows | None
     open_signs: int  # amplitudes that are dropped because their sign is undetermined
@@ -67,7 +70,7 @@ class Arrivals(ABC):
         self.site, self.streams = site, streams
         self.imu = InertialStream(site.platform.imu.time_offset)
         self.fields, self.static, self.others = [], {}, OtherMeasurements()
-        self.last_epoch, self.open_signs = -np.inf, 0
+        self.last_epoch, self.fields_latency, self.open_signs = -np.inf, 0.0, 0
         self.short, self.without = None, Counter()
         self._detection, self._still = DetectionFilter(), StillSamples()
         self._last_sample_times = {}
@@ -121,6 +124,9 @@ class Arrivals(ABC):
         """Add phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
         samples = sensor_frame_phasors(self.site, samples)
         check_clock("fields", samples.time, self.newest)
+        # Phasors arrive when their window ends, with the samples of a record.
+        latency = samples.window / 2.0 + LONGEST_RECORD
+        self.fields_latency = float(np.max(latency, initial=self.fields_latency))
         late = self._add_epochs(samples, static, after)
         self.fields.sort(key=lambda s: float(s.time[0]))
         received = np.append([s.time[0] for s in self.fields], samples.time)
@@ -146,6 +152,13 @@ class Arrivals(ABC):
     @abstractmethod
     def next_field(self) -> float:
         """Time of the next fields (s), as far as is known."""
+
+    @property
+    def _next_arrival(self) -> float:
+        """Earliest time of phasors that have not arrived yet (s); infinity if there are none."""
+        if not self.fields_latency:
+            return np.inf
+        return max(self._newest_field, self.awaited - self.fields_latency)
 
     @property
     @abstractmethod

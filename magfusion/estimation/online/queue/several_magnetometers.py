@@ -169,7 +169,8 @@ class SeveralArrivals(Arrivals):
         silent = self._silent()
         live = [stream for name, stream in self._named if stream.windows or name not in silent]
         known = [float(samples.time[0]) for samples in self.fields[:1]]
-        return min([*known, *(stream.next_centre for stream in live)], default=np.inf)
+        centres = [stream.next_centre for stream in live]
+        return min([*known, *centres, self._next_arrival], default=np.inf)
 
     @property
     def window_to_come(self) -> bool:

@@ -68,7 +68,9 @@ class SingleArrivals(Arrivals):
     @property
     def next_field(self) -> float:
         """Time of the next fields (s), as far as is known."""
-        return float(self.fields[0].time[0]) if self.fields else self.stream.next_centre
+        if self.fields:
+            return float(self.fields[0].time[0])
+        return min(self.stream.next_centre, self._next_arrival)
 
     @property
     def newest(self) -> float:
