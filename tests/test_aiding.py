@@ -280,6 +280,17 @@ def test_a_table_without_names_has_one_sensor(tmp_path):
         read_log(tmp_path / "log")
 
 
+def test_a_range_without_an_echo_is_no_sample_and_none_is_negative(tmp_path):
+    write_log(replace(_simulated(duration=6.0).log, aiding={}), tmp_path / "log")
+    epoch = read_log(tmp_path / "log").epoch_ns
+    table = tmp_path / "log" / "range.csv"
+    table.write_text(f"time_ns,range\n{epoch + 10**9},0.5\n{epoch + 2 * 10**9},nan\n")
+    assert read_log(tmp_path / "log").aiding["range"].value.tolist() == [[0.5]]
+    table.write_text(f"time_ns,range\n{epoch},-0.5\n")
+    with pytest.raises(InputError, match="column range, row 0.*found -0.5; write 0 m or more"):
+        read_log(tmp_path / "log")
+
+
 def test_samples_beyond_the_rate_are_left_out():
     sensor = replace(SITE.aiding[0], rate_hz=10.0)
     time = np.arange(0.0, 1.0, 0.02)

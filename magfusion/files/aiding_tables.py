@@ -56,7 +56,9 @@ def _read_quantity(quantity: Quantity, table: Table) -> dict[str, AidingSamples]
     marks, of_row = table.texts(MARK) if quantity == "mark" else ([], which)
     value, out = _values(quantity, table), dict[str, AidingSamples]()
     for name, own in rows_by_name(table, names, which, "sample"):
-        there = own[np.isfinite(value[own]).any(axis=1)] if COLUMNS[quantity] else own
+        exists = np.isfinite(value[own])
+        is_measured = exists.any(axis=1) if quantity == "velocity" else exists.all(axis=1)
+        there = own[is_measured]
         of_sample = tuple(marks[of_row[i]] for i in there) if quantity == "mark" else ()
         out[name] = AidingSamples(quantity, table.time[there], value[there], of_sample)
     return out
@@ -66,12 +68,17 @@ def _values(quantity: Quantity, table: Table) -> Array:
     value = np.full((len(table), len(COLUMNS[quantity])), np.nan)
     for i, name in enumerate(COLUMNS[quantity]):
         if table.has((name,)):
-            value[:, i] = table.numbers((name,), nan=quantity == "velocity")[:, 0]
+            # A time without a measurement, as of a range without an echo, has no number.
+            value[:, i] = table.numbers((name,), nan=quantity != "relative_pose")[:, 0]
     if quantity == "relative_pose":
         remedy = f"more than 0 s; of more than {LONGEST_INTERVAL:g} s they are not used"
         table.refuse(value[:, 0] <= 0.0, "interval_s", value[:, 0], remedy)
         turn = unit_rotation(table).as_rotvec()
         return np.hstack([value[:, : -len(QUATERNION)], turn])
+    if quantity == "range":
+        table.refuse(
+            value[:, 0] < 0.0, "range", value[:, 0], "write 0 m or more, or nan for no echo"
+        )
     return value * UNIT.get(quantity, 1.0)
 
 
