@@ -287,7 +287,7 @@ def test_a_range_without_an_echo_is_no_sample_and_none_is_negative(tmp_path):
     table.write_text(f"time_ns,range\n{epoch + 10**9},0.5\n{epoch + 2 * 10**9},nan\n")
     assert read_log(tmp_path / "log").aiding["range"].value.tolist() == [[0.5]]
     table.write_text(f"time_ns,range\n{epoch},-0.5\n")
-    with pytest.raises(InputError, match="column range, row 0.*found -0.5; write 0 m or more"):
+    with pytest.raises(InputError, match=r"column range, row 0.*found -0.5; write 0 m or more"):
         read_log(tmp_path / "log")
 
 
