@@ -392,6 +392,10 @@ def test_a_sensor_that_contradicts_for_long_is_named():
     assert "wheels" in last.judgement.findings[0].text
     error = last.position_world - simulated.motion.position_world(np.array([last.time]))[0]
     assert np.linalg.norm(error) < 0.02  # m
+    _, trust = mf.judge_result(mf.smooth(log, aided_site(WHEELS)), log)
+    assert [f.code for f in trust.reasons] == ["aiding_disagrees"]
+    _, trust = mf.judge_result(mf.smooth(simulated.log, aided_site(WHEELS)), simulated.log)
+    assert trust.verdict is mf.Verdict.TRUSTWORTHY
 
 
 def test_samples_of_a_sensor_that_the_site_lacks_are_refused():

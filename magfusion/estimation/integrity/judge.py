@@ -33,6 +33,7 @@ from magfusion.estimation.integrity.residual_blocks import (
     together,
 )
 from magfusion.estimation.integrity.score import Score, field_residual, moved_estimate, scores_of
+from magfusion.estimation.integrity.smoothed_separation import contradicting_sensors
 from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
@@ -131,7 +132,7 @@ def judged_with_score(result: R, log: Log, online: Site | None = None) -> Judged
 
 def _run_tests(case: Case) -> Iterator[TestResult]:
     """Yield all test results; that of fixed parameters first, as it may explain the others."""
-    of_held, priors, biases = (
+    of_fixed, priors, biases = (
         check_fixed_parameters(case),
         calibration_change(case),
         bias_change(case),
@@ -139,59 +140,67 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     biases = biases if case.log.inertial else NOTHING
     change = changed(case)
     if (
-        bent := steel(case, max(of_held.gain, change.gain), doubted=bool(priors.findings))
+        bent := steel(case, max(of_fixed.gain, change.gain), doubted=bool(priors.findings))
     ) is not None:
-        yield from _with_steel(case, bent, of_held, priors, biases)
+        yield from _with_steel(case, bent, of_fixed, priors, biases)
         return
     if change.findings:  # it explains more than whatever is wrong throughout
-        of_held = TestResult(unverified=of_held.unverified)
-    of_held, causes, residuals = _with_residuals(case, of_held)
-    cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
+        of_fixed = TestResult(unverified=of_fixed.unverified)
+    of_fixed, causes, residuals = _with_residuals(case, of_fixed)
+    cause, prior, rest = (_weight(findings) for findings in (of_fixed, priors, residuals[0]))
     cause = max(cause, _weight(change))
-    if causes < len(of_held.named) and rest:  # residuals that none of them explains
-        of_held = replace(of_held, findings=of_held.findings[:causes])
+    if causes < len(of_fixed.named) and rest:  # residuals that none of them explains
+        of_fixed = replace(of_fixed, findings=of_fixed.findings[:causes])
     if (causes or change.findings) and cause > prior:
         residuals = [_traces(findings, 10.0 * cause) for findings in residuals]
     if prior > STRONGER * cause:
-        of_held = _traces(of_held, prior)
-    yield of_held
+        of_fixed = _traces(of_fixed, prior)
+    yield of_fixed
     yield from residuals
     yield _traces(compass(case), cause)
     yield change
     yield _traces(priors, cause)
     yield _traces(biases, cause)
+    yield _sensors(case, of_fixed)
     for monitor in (fixes, together, convergence, geometry, rivals):
         yield monitor(case)
+
+
+def _sensors(case: Case, of_fixed: TestResult) -> TestResult:
+    """Return the test of aiding sensors without a named cause."""
+    explained = {block.owner for one in of_fixed.causes for block in one.fault.blocks}
+    return TestResult(contradicting_sensors(case.result, explained))
 
 
 def _with_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[TestResult]:
     """Yield all test results where steel explains those of fields and parameters."""
-    of_held, priors, biases = others
+    of_fixed, priors, biases = others
     cause = _weight(bent)
-    yield replace(bent, unverified=of_held.unverified)
+    yield replace(bent, unverified=of_fixed.unverified)
     for findings in (*_residuals(case, *_explained(case, ())[0]), priors):
         yield _traces(findings, 10.0 * cause)
     yield _traces(compass(case), cause)
     yield _traces(biases, cause)
+    yield _sensors(case, of_fixed)
     for monitor in (fixes, together, convergence, geometry, rivals):
         yield monitor(case)
 
 
-def _with_residuals(case: Case, of_held: TestResult) -> tuple[TestResult, int, list[TestResult]]:
+def _with_residuals(case: Case, of_fixed: TestResult) -> tuple[TestResult, int, list[TestResult]]:
     """Return the test of fixed parameters, and the residuals that it does not explain.
 
     With the number of its causes that explain them. One that explains the residuals of the fields
     is named for them, though it moves no pose.
     """
-    after, causes = _explained(case, of_held.named)
+    after, causes = _explained(case, of_fixed.named)
     residuals = _residuals(case, *after)
     if causes or not residuals[0].findings:
-        return of_held, causes, residuals
+        return of_fixed, causes, residuals
     other = check_fixed_parameters(case, without_effect=True)
     after, causes = _explained(case, other.named)
     explained = _residuals(case, *after) if causes else residuals
     if not causes or explained[0].findings:
-        return of_held, 0, residuals
+        return of_fixed, 0, residuals
     return other, causes, explained
 
 

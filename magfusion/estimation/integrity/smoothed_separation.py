@@ -1,10 +1,11 @@
 """The smoothed trajectory without each beacon or sensor: alarms and protection levels by state."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import AT_ONCE
@@ -22,8 +23,11 @@ from magfusion.estimation.posterior.information_contributions import Parts, part
 from magfusion.estimation.posterior.separation import OPEN_POSITION, OPEN_ROTATION, Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
+FALSE_REJECTIONS = 1e-3  # of true samples of aiding sensors: a thousandth of their information
+CONTRADICTS = 0.25  # share of rejected samples beyond which a sensor is not as declared
 # A prior that keeps undetermined states finite: far wider than any useful covariance.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
 
@@ -66,6 +70,35 @@ def aiding_used(result: Smoothed) -> list[str]:
     """Return the aiding sensors with samples in a result."""
     measured = (m for m in result.graph.measurements if isinstance(m, AidingMeasurement))
     return list(dict.fromkeys(m.sensor for m in measured))
+
+
+def disagreement(sensor: str, share: float) -> Finding:
+    """Return the finding on an aiding sensor of whose samples a share is rejected."""
+    return Finding(
+        "aiding_disagrees",
+        f"{sensor} contradicts the estimate, {100.0 * share:.0f} % of its samples are not used: it"
+        " slips or is blocked, or its unit, scale, mounting, lever arm or clock is not as declared."
+        " Correct it in the site's aiding, or leave the sensor out.",
+        Verdict.DOUBTFUL,
+        share / CONTRADICTS,
+    )
+
+
+def contradicting_sensors(result: Smoothed, explained: Collection[str]) -> tuple[Finding, ...]:
+    """Return the findings on aiding sensors whose robust loss rejects too many samples.
+
+    `explained`: sensors of which a parameter is named already.
+    """
+    rejected: dict[str, list[BoolArray]] = {}
+    for measured in result.graph.measurements:
+        if isinstance(measured, AidingMeasurement) and measured.sensor not in explained:
+            error = result.graph.residual(measured, result.estimate)
+            numbers = np.sum(np.isfinite(measured.sigma), axis=1)
+            square = np.sum(error.reshape(len(error), -1) ** 2, axis=1)
+            beyond = square > chdtri(np.maximum(numbers, 1), FALSE_REJECTIONS)
+            rejected.setdefault(measured.sensor, []).append(beyond)
+    shares = {name: float(np.mean(np.concatenate(parts))) for name, parts in rejected.items()}
+    return tuple(disagreement(*one) for one in shares.items() if one[1] > CONTRADICTS)
 
 
 def separate_sensors(result: Smoothed) -> Separation | None:

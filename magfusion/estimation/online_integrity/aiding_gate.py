@@ -9,18 +9,20 @@ from scipy.special import chdtri
 
 from magfusion.estimation.graph.measurement import Measurement, group_distances
 from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.integrity.smoothed_separation import (
+    CONTRADICTS,
+    FALSE_REJECTIONS,
+    disagreement,
+)
 from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.parameters import Block
-from magfusion.model.trust import Finding, Verdict
 
-FALSE_REJECTIONS = 1e-3  # of true samples, which costs a thousandth of the information
 # The same after a rejection: a slip goes on, while the prediction becomes less certain.
 FALSE_REJECTIONS_AGAIN = 0.05
 SCORED_LOSS = "cauchy"  # of rejected samples in the score: slips do not name a parameter
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
 MEMORY = 0.995  # of the share of rejections, per sample
-CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
 FREEDOM = (1, 2, 3, 6)
 GATE = {k: float(chdtri(k, FALSE_REJECTIONS)) for k in FREEDOM}
 GATE_AGAIN = {k: float(chdtri(k, FALSE_REJECTIONS_AGAIN)) for k in FREEDOM}
@@ -82,16 +84,5 @@ class AidingGate:
             if share > CONTRADICTS or time > self.rejected_since.get(sensor, time) + REJECTED_LONG
         }
         return judgement.with_findings(
-            *(
-                Finding(
-                    "aiding_disagrees",
-                    f"{sensor} contradicts the estimate, {100.0 * share:.0f} % of its samples are"
-                    " not used: it slips or is blocked, or its scale, mounting, lever arm or clock"
-                    " is not as declared; smooth the log to see which, correct it in the site's"
-                    " aiding, or leave the sensor out.",
-                    Verdict.DOUBTFUL,
-                    share / CONTRADICTS,
-                )
-                for sensor, share in contradicting.items()
-            )
+            *(disagreement(sensor, share) for sensor, share in contradicting.items())
         )
