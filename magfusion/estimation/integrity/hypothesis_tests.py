@@ -18,7 +18,8 @@ from magfusion.estimation.integrity.beacon_causes import (
     survey_causes,
 )
 from magfusion.estimation.integrity.corrected_site import with_magnetometer
-from magfusion.estimation.integrity.explanation import ENOUGH, Explanation, clearly_best
+from magfusion.estimation.integrity.explanation import ENOUGH, MARGIN, Explanation, clearly_best
+from magfusion.estimation.integrity.fault_candidates import EPOCH_SHIFT
 from magfusion.estimation.integrity.field_causes import global_causes
 from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
 from magfusion.estimation.integrity.motion_causes import (
@@ -77,6 +78,8 @@ def cause_of(
         return of_motion, of_motion.text(OF_MOTION)
     if of_fields is not None and of_fields.code == LEFT_HANDED:
         of_fields = replace(of_fields, site=_with_right_axes(samples, part.imu, site))
+    if of_fields is not None and of_fields.code == EPOCH_SHIFT:
+        of_fields = _delayed(of_fields, samples, part.imu)
     if of_fields is not None:
         return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
     return None
@@ -220,6 +223,24 @@ def _with_right_axes(samples: FieldSamples, imu: ImuSamples, site: Site) -> Site
     every = surveyed(samples, initial_calibration(reversed_axes, float(np.mean(samples.time))))
     motion = compared(every, imu, reversed_axes)
     return None if motion is None else with_quarter_turn(motion, reversed_axes)
+
+
+def _delayed(shifted: Explanation, samples: FieldSamples, imu: ImuSamples) -> Explanation:
+    """Return a shift of all stamps, or its rival, of the magnetometer's, as the motion has it."""
+    site, rival = shifted.site, shifted.rival
+    if site is None or rival is None or rival.site is None:
+        return shifted
+    alone = [one.platform.magnetometer.clock_offset for one in (rival.site, site)]
+    every = surveyed(samples, initial_calibration(site, float(np.mean(samples.time))))
+    squares = []
+    for late in (0.0, alone[0] - alone[1]):
+        motion = compared(every, imu, site, late=late)
+        if motion is None:
+            return shifted
+        squares.append(motion.explained(EYE, EYE)[0])
+    if squares[0] < squares[1] + MARGIN:
+        return shifted
+    return replace(rival, rival=replace(shifted, rival=None))
 
 
 def _part(log: Log) -> Log:
