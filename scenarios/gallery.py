@@ -270,11 +270,11 @@ def report(rows: list[Row]) -> str:
         own = [row for row in rows if row.fault == kind]
         lines.append(f"{kind:10} {sum(row.right for row in own)} of {len(own)} right")
         lines += [f"  {row}" for row in own if not row.right]
-    found = summary(rows)
-    ratio = found["error_m"] / found["predicted_m"]
+    result = summary(rows)
+    ratio = result["error_m"] / result["predicted_m"]
     lines.append(
-        f"rms error {1e3 * found['error_m']:.1f} mm, predicted"
-        f" {1e3 * found['predicted_m']:.1f} mm: {ratio:.2f} times"
+        f"rms error {1e3 * result['error_m']:.1f} mm, predicted"
+        f" {1e3 * result['predicted_m']:.1f} mm: {ratio:.2f} times"
     )
     return "\n".join(lines)
 
