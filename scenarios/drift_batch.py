@@ -111,7 +111,9 @@ def main() -> None:
     given = parser.parse_args()
     config = Config(given.hours, given.worlds, given.seed, given.phase_known)
     rows = [run_world(config, world) for world in range(config.worlds)]
-    conclude(report(config, rows), {"rows": rows})
+    nees = [row.nees for row in rows]
+    figures = {"least_nees": min(nees), "largest_nees": max(nees), "rows": rows}
+    conclude(report(config, rows), figures)
 
 
 if __name__ == "__main__":

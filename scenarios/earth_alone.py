@@ -35,6 +35,26 @@ LOGS = Path(__file__).parents[2] / "shared" / "logs"
 
 
 @dataclass(frozen=True)
+class Case:
+    """A log, and the group that it is averaged with."""
+
+    group: str
+    log: Log
+    site: Site
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Means of one way over a group of logs (deg)."""
+
+    group: str
+    way: str
+    heading_deg: float
+    tilt_deg: float
+    heading_nees: float | None
+
+
+@dataclass(frozen=True)
 class Row:
     """Errors of one way on one log (deg)."""
 
@@ -93,13 +113,27 @@ def rows_of(log: Log, site: Site) -> Iterator[Row]:
         )
 
 
-def _cases(seeds: int, shares: list[float], logs: Path) -> Iterator[tuple[Log, Site]]:
+def mean_of(group: str, way: str, rows: list[Row]) -> Mean:
+    """Return the means of the rows of one way."""
+    own = [row for row in rows if row.way == way]
+    nees = [row.heading_nees for row in own if row.heading_nees is not None]
+    return Mean(
+        group,
+        way,
+        float(np.mean([row.heading_deg for row in own])),
+        float(np.mean([row.tilt_deg for row in own])),
+        float(np.mean(nees)) if nees else None,
+    )
+
+
+def _cases(seeds: int, shares: list[float], logs: Path) -> Iterator[Case]:
     for kind in KINDS:
         for share in shares:
+            group = "as declared" if share == 1.0 else f"{1.0 / share:g} times better"
             for seed in range(FIRST_SEED, FIRST_SEED + seeds):
-                yield simulated(kind, seed, share=share)
+                yield Case(group, *simulated(kind, seed, share=share))
     for path in sorted(logs.glob("earth_*")):
-        yield open_log(path), load_site(path / "site.yaml", without=True)
+        yield Case("real", open_log(path), load_site(path / "site.yaml", without=True))
 
 
 def main() -> None:
@@ -111,25 +145,25 @@ def main() -> None:
     )
     parser.add_argument("--logs", type=Path, default=LOGS, help="directory of logs earth_*")
     arguments = parser.parse_args()
-    rows = []
-    for log, site in _cases(arguments.seeds, arguments.shares, arguments.logs):
-        for row in rows_of(log, site):
-            rows.append(row)
+    groups: dict[str, list[Row]] = {}
+    for case in _cases(arguments.seeds, arguments.shares, arguments.logs):
+        for row in rows_of(case.log, case.site):
+            groups.setdefault(case.group, []).append(row)
             head = f"heading {row.heading_deg:6.2f} ({row.scatter_deg:5.2f})"
             text = f"{head} tilt {row.tilt_deg:5.2f}"
             claim = "" if row.heading_nees is None else f"  nees {row.heading_nees:5.2f}"
             print(f"{row.log:34} {row.way:12} {text}{claim}", flush=True)
-    means: dict[str, dict[str, float]] = {}
-    for way in dict.fromkeys(row.way for row in rows):
-        own = [r for r in rows if r.way == way]
-        means[way] = {
-            "heading_deg": float(np.mean([r.heading_deg for r in own])),
-            "tilt_deg": float(np.mean([r.tilt_deg for r in own])),
-        }
-    lines = [
-        f"{'mean':34} {way:12} heading {mean['heading_deg']:6.2f} tilt {mean['tilt_deg']:5.2f}"
-        for way, mean in means.items()
+    means = [
+        mean_of(group, way, rows)
+        for group, rows in groups.items()
+        for way in dict.fromkeys(row.way for row in rows)
     ]
+    lines = [
+        f"{f'mean, {one.group}':34} {one.way:12} heading {one.heading_deg:6.2f} tilt"
+        f" {one.tilt_deg:5.2f}"
+        for one in means
+    ]
+    rows = [row for group in groups.values() for row in group]
     conclude("\n".join(lines), {"rows": rows, "means": means})
 
 

@@ -252,6 +252,17 @@ def run_one(site: Site, kind: str, seed: int) -> Row:
     return Row(seed, kind, beacon, str(figures["verdict"]), named, right, error, predicted)
 
 
+def summary(rows: list[Row]) -> dict[str, float]:
+    """Return how many are right, and the rms errors of fixes where nothing is at fault (m)."""
+    good = [row for row in rows if row.fault == "none"]
+    return {
+        "accepted": sum(row.right for row in good),
+        "named": sum(row.right for row in rows if row.fault != "none"),
+        "error_m": rms(np.array([row.error_m for row in good])),
+        "predicted_m": rms(np.array([row.predicted_m for row in good])),
+    }
+
+
 def report(rows: list[Row]) -> str:
     """Return the table."""
     lines = []
@@ -259,11 +270,11 @@ def report(rows: list[Row]) -> str:
         own = [row for row in rows if row.fault == kind]
         lines.append(f"{kind:10} {sum(row.right for row in own)} of {len(own)} right")
         lines += [f"  {row}" for row in own if not row.right]
-    good = [row for row in rows if row.fault == "none"]
-    ratio = rms(np.array([r.error_m for r in good])) / rms(np.array([r.predicted_m for r in good]))
+    result = summary(rows)
+    ratio = result["error_m"] / result["predicted_m"]
     lines.append(
-        f"rms error {1e3 * rms(np.array([r.error_m for r in good])):.1f} mm, predicted"
-        f" {1e3 * rms(np.array([r.predicted_m for r in good])):.1f} mm: {ratio:.2f} times"
+        f"rms error {1e3 * result['error_m']:.1f} mm, predicted"
+        f" {1e3 * result['predicted_m']:.1f} mm: {ratio:.2f} times"
     )
     return "\n".join(lines)
 
@@ -282,7 +293,7 @@ def main() -> None:
             row = run_one(site, kind, seed)
             print(f"{kind:10} {seed} {row.answer:10} {'right' if row.right else row}", flush=True)
             rows.append(row)
-    conclude(report(rows), {"beacons": len(site.beacons), "rows": rows})
+    conclude(report(rows), {"beacons": len(site.beacons), "summary": summary(rows), "rows": rows})
 
 
 if __name__ == "__main__":

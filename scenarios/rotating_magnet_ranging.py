@@ -260,6 +260,8 @@ class Judgement:
     direction_rms_deg: float
     depth_rms_m: float
     nees: float
+    largest_nees: float
+    largest_residual_rms: float
     fulfilled: bool | None  # None where there is no rule
 
 
@@ -348,6 +350,8 @@ def judge_ranging(rows: list[Row]) -> Judgement:
         rms(np.array([row.direction_error_deg for row in rows])),
         rms(np.array([row.depth_error_m for row in rows])),
         mean,
+        max(row.nees for row in rows),
+        max(row.residual_rms for row in rows),
         good if first.angle == "measured" else None,
     )
 

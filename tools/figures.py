@@ -6,8 +6,9 @@ ends the command's output has it; ``{rows.smooth.both.error_m}`` is of the one o
 both words among its values.  A row of a table is a sentence; ``{}`` is a number that is compared by
 another command's.
 
-``python tools/figures.py`` runs what takes seconds or minutes; ``--release`` everything.  What is
-measured at a commit is kept in ``--results``, so that a run that was stopped goes on.
+``python tools/figures.py`` runs what takes seconds or minutes; ``--release`` everything, and
+``--only WORDS`` the commands that have these words.  What is measured at a commit is kept in
+``--results``, so that a run that was stopped goes on.
 """
 
 import argparse
@@ -170,6 +171,7 @@ def main() -> int:
     """Run the commands, print the table, and return 1 where a figure differs."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--release", action="store_true", help="also what takes hours")
+    parser.add_argument("--only", metavar="WORDS", help="commands that have these words")
     parser.add_argument("--results", type=Path, default=ROOT / "figures_measured", help="directory")
     options = parser.parse_args()
     commit = _git("rev-parse", "--short", "HEAD") + ("+" if _git("status", "--porcelain") else "")
@@ -177,7 +179,7 @@ def main() -> int:
     print(f"{datetime.now(UTC):%Y-%m-%d}, commit {commit}\n")
     print("| page | command | figure | printed | measured | |\n|---|---|---|---|---|---|")
     for entry in register().figures:
-        if entry.command is None or (entry.takes == "hours" and not options.release):
+        if entry.command is None or not _chosen(entry, options.release, options.only):
             continue
         if "{logs}" in entry.command and not LOGS.is_dir():
             print(f"| {entry.page} | `{entry.command}` | | | | no recorded logs here |")
@@ -188,6 +190,12 @@ def main() -> int:
             mark = "" if one.agrees else "**differs**"
             print(f"| {entry.page} | `{entry.command}` | {row} | {mark} |", flush=True)
     return int(wrong > 0)
+
+
+def _chosen(entry: Entry, release: bool, only: str | None) -> bool:
+    if only is not None:
+        return only in (entry.command or "")
+    return release or entry.takes != "hours"
 
 
 def _kept(command: str, commit: str, results: Path) -> Any:
