@@ -92,6 +92,9 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
     """Return the sums with the innovations of some consecutive epochs."""
     own, rest = slice(0, targets.size), targets.rest
     error, jacobian, is_used = _rows(epochs, targets)
+    # Of hundreds of beacons few are detected: the rows of the others are empty.
+    filled = np.any(error, axis=0) | np.any(jacobian, axis=(0, 2))
+    error, jacobian, is_used = error[:, filled], jacobian[:, filled], is_used[:, filled]
     by_state = jacobian[..., : targets.whole]
     by_held = jacobian[..., targets.columns] * targets.unit
     cov = np.array([epoch.predicted.cov for epoch in epochs])
