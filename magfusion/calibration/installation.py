@@ -140,7 +140,8 @@ def _released(
 
 
 def _check_of(declared: MarkedSnapshots, fit: _Released) -> BeaconCheck:
-    cov = np.linalg.inv(fit.information)
+    # Parameters have priors; the pose of a stop that no field determines has none, and no part.
+    cov = np.linalg.pinv(fit.information, hermitian=True)
     start = 6 * len(fit.estimate.turn)
     refined = fit.estimate.calibration
 
