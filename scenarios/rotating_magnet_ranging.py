@@ -388,9 +388,8 @@ def main() -> None:
     given = parser.parse_args()
     rows, result = list[Row](), list[Judgement]()
     for case in (CROSSING, PAIR):
-        for encoder in (True, False):
+        for encoder, runs in ((True, given.runs), (False, given.others)):
             config = Config(seed=given.seed, encoder=encoder)
-            runs = given.runs if encoder else given.others
             own = [run_one(case, config, given.seed + k) for k in range(runs)]
             rows += own
             result += [judge_ranging(own)] if own else []

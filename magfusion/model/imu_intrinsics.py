@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
 
@@ -32,3 +33,19 @@ class ImuIntrinsics:
         """Return the measured values of `corrected` ones."""
         gyro = gyro_body @ self.gyro_matrix.T + accel_body @ self.gyro_g_sensitivity.T
         return np.asarray(gyro), np.asarray(accel_body @ self.accel_matrix.T)
+
+
+def turn_of_imu(before: ImuIntrinsics | None, after: ImuIntrinsics | None) -> Rotation:
+    """Return the rotation to the axes of an IMU that is corrected for being rotated.
+
+    The identity where they differ in anything else.
+    """
+    known, result = before or ImuIntrinsics(), after or ImuIntrinsics()
+    gyro = np.linalg.solve(known.gyro_matrix, result.gyro_matrix)
+    accel = np.linalg.solve(known.accel_matrix, result.accel_matrix)
+    is_rotated = np.allclose(gyro, accel, rtol=1e-5, atol=1e-8) and np.allclose(
+        gyro @ gyro.T, np.eye(3), rtol=1e-5, atol=1e-8
+    )
+    if not is_rotated or np.linalg.det(gyro) < 0.0:
+        return Rotation.identity()
+    return Rotation.from_matrix(gyro.T)

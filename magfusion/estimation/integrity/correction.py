@@ -34,7 +34,7 @@ from magfusion.estimation.integrity.hypothesis_tests import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
 from magfusion.files.site_changes import changed_keys
-from magfusion.model.imu_intrinsics import ImuIntrinsics
+from magfusion.model.imu_intrinsics import turn_of_imu
 from magfusion.model.parameters import SENSOR_POSITION, Block, Calibration, initial_calibration
 from magfusion.model.parameters.inertial import Bias
 from magfusion.model.site import Site
@@ -67,9 +67,7 @@ class Correction(NamedTuple):
 
     finding: Finding  # what is wrong
     site: Site  # in which it is undone
-    fault: FaultCandidate | None = (
-        None  # the candidate fault, if it is an incorrect fixed parameter
-    )
+    fault: FaultCandidate | None = None  # if it is of a fixed parameter
     rivals: tuple[Rival, ...] = ()
     step_spread: Array | None = None  # (states or 1, 6, 6), by the uncertainty of the step
     clear: bool = False  # whether snapshots of the fields alone are sure of it
@@ -293,7 +291,7 @@ def _other_frame(declared: Site, corrected: Site, probability: float) -> tuple[R
     before, after = declared.platform, corrected.platform
     one, other = before.magnetometer, after.magnetometer
     turn = Rotation.from_matrix(other.body_from_sensor @ one.body_from_sensor.T)
-    turn *= _turn_of_imu(before.imu_intrinsics, after.imu_intrinsics)
+    turn *= turn_of_imu(before.imu_intrinsics, after.imu_intrinsics)
     turn_body = turn.as_rotvec()
     if not turn_body.any():
         return ()
@@ -302,17 +300,6 @@ def _other_frame(declared: Site, corrected: Site, probability: float) -> tuple[R
     spread = probability * _outer(np.concatenate([turn_body, shift_body])[None])
     size = -shift_body / TYPICAL[SENSOR_POSITION]
     return (Rival(LEVER_ARM, size, spread, is_frame=True),)
-
-
-def _turn_of_imu(before: ImuIntrinsics | None, after: ImuIntrinsics | None) -> Rotation:
-    """Return the rotation to the axes of an IMU that is corrected for being turned."""
-    known, result = before or ImuIntrinsics(), after or ImuIntrinsics()
-    gyro = np.linalg.solve(known.gyro_matrix, result.gyro_matrix)
-    accel = np.linalg.solve(known.accel_matrix, result.accel_matrix)
-    is_turned = np.allclose(gyro, accel) and np.allclose(gyro @ gyro.T, np.eye(3))
-    if not is_turned or np.linalg.det(gyro) < 0.0:
-        return Rotation.identity()
-    return Rotation.from_matrix(gyro.T)
 
 
 def _outer(step: Array) -> Array:

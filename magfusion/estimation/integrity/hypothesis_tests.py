@@ -230,10 +230,10 @@ def _delayed(shifted: Explanation, samples: FieldSamples, imu: ImuSamples) -> Ex
     site, rival = shifted.site, shifted.rival
     if site is None or rival is None or rival.site is None:
         return shifted
-    alone = [one.platform.magnetometer.clock_offset for one in (rival.site, site)]
+    known, other = (one.platform.magnetometer.clock_offset for one in (site, rival.site))
     every = surveyed(samples, initial_calibration(site, float(np.mean(samples.time))))
     squares = []
-    for late in (0.0, alone[0] - alone[1]):
+    for late in (0.0, other - known):
         motion = compared(every, imu, site, late=late)
         if motion is None:
             return shifted

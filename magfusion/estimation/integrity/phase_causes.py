@@ -127,7 +127,8 @@ def _late(by_shift: Explanation, site: Site, shift: float) -> Explanation | None
 def _in_phase(known: Snapshots, phase: Array) -> Site | None:
     """Return a site with phases (rad) of its channels added; None where one is unknown."""
     steps: dict[str, list[float]] = {}
-    for (name, _), step in zip(known.samples.channels, phase.tolist(), strict=True):
+    within_turn = np.angle(np.exp(1j * phase))  # which the fields do not distinguish
+    for (name, _), step in zip(known.samples.channels, within_turn.tolist(), strict=True):
         steps.setdefault(name, []).append(step)
     if not np.all(np.isfinite(phase)):
         return None
