@@ -109,19 +109,21 @@ def _scored(*, used: bool, rejected: bool) -> Sums:
     site = aided_site(WHEELS)
     score = OnlineScore(site, (), (), static=False)
     size, cov = len(score.targets.unit), np.diag(np.repeat([0.02, 0.05, 0.05, 0.02, 0.002], 3) ** 2)
-    score._sums = new_sums(np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size)), 0.0)
+    none = np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size))
+    score._sums = new_sums(*none, 0.0, cov)
     velocity = np.array([1.0, 0.0, 0.0])
     rest = np.zeros(3), np.zeros(3), initial_calibration(site, 0.0), cov
     states = [State(t, np.eye(3), t * velocity, velocity, *rest) for t in (0.0, 0.1)]
     samples = AidingSamples("velocity", np.array([0.1]), np.array([[1.1, np.nan, np.nan]]))
     wheels = aiding_measurement(WHEELS, samples)
     imu = ImuSamples(np.array([0.05]), np.zeros((1, 3)), np.array([[0.0, 0.0, site.gravity]]))
-    score.predict(states[0], states[1], np.eye(MOTION), imu)
+    score.predict(states[0], states[1], np.eye(MOTION), np.zeros((MOTION, MOTION)), imu)
     score.measured([wheels] if used else [], states[1], [wheels] if rejected else [])
     sums = score.settle()
     assert sums is not None
     own = slice(size)  # without steps of the biases
-    return new_sums(sums.information[own, own], sums.gradient[own], sums.response[:, own], 0.0)
+    scored = sums.information[own, own], sums.gradient[own], sums.response[:, own]
+    return new_sums(*scored, 0.0, cov)
 
 
 def test_rejected_samples_are_scored_without_a_gain() -> None:

@@ -74,17 +74,17 @@ def test_who_comes_later_is_asked_as_if_it_had_been_there_all_the_time() -> None
     assert are_many(site)
     every, some = (OnlineScore(site, (), (), static=False) for _ in range(2))
     every._detected_at = dict.fromkeys((b.name for b in site.beacons), 0.0)
-    every.begin(nothing_yet(every), 0.0)
-    some._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
-    some.begin(nothing_yet(some), 0.0)
     before = state_at(site, 0.0, rng)
+    every.begin(nothing_yet(every), before)
+    some._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
+    some.begin(nothing_yet(some), before)
     for k in range(6):
         state = state_at(site, STEP * (k + 1), rng)
         result = phasors_at(state, site, [k, k + 1, k + 2], rng)
         transition = np.eye(MOTION)
         transition[3:6, 6:9] = STEP * np.eye(3)
         for score in (every, some):
-            score.predict(before, state, transition, NO_OWNER)
+            score.predict(before, state, transition, np.zeros((MOTION, MOTION)), NO_OWNER)
             score.measured([result], state)
         before = state
     assert every._sums is not None
@@ -109,7 +109,7 @@ def test_nobody_is_asked_of_long_after_it_was_heard() -> None:
     site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
     score = OnlineScore(site, (), (), static=False)
     score._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
-    score.begin(nothing_yet(score), 0.0)
+    score.begin(nothing_yet(score), state_at(site, 0.0, rng))
     for time, detected in ((1.0, 1), (MEMORY + 2.0, 10)):
         state = state_at(site, time, rng)
         score.measured([phasors_at(state, site, [detected], rng)], state)

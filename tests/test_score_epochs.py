@@ -81,9 +81,8 @@ def test_an_epoch_that_measured_nothing_only_carries_the_response_on() -> None:
     size = len(last.predicted.cov)
     transition = np.eye(size)
     transition[3:6, 6:9] = 0.5 * np.eye(3)
-    result = add_epochs(
-        sums, [Epoch(last.predicted, EpochTransition(transition, turns, none, none))], requested
-    )
+    led = EpochTransition(transition, turns, none, none, np.zeros((size, size)))
+    result = add_epochs(sums, [Epoch(last.predicted, led)], requested)
     own = transition[: requested.size, : requested.size]
     gravity = next(b.columns for b in requested.fixed_blocks if b.owner == "site")
     others = np.setdiff1d(np.arange(len(requested.unit)), np.arange(gravity.start, gravity.stop))

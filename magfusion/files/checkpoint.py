@@ -23,7 +23,7 @@ from magfusion.files.atomic import whole_file
 from magfusion.units import AnyArray
 
 MAGIC = b"magfusion state\n"
-VERSION = 21  # to be raised with every change of what a run keeps
+VERSION = 22  # to be raised with every change of what a run keeps
 LARGEST_CONTENT = 1 << 28  # bytes
 # MessagePack reserves what a list announces before it reads it, on each of 1024 levels.
 LONGEST_LIST = 1 << 14

@@ -102,7 +102,7 @@ class EpochUpdate:
         self.gate.watch.begin(start.excluded, start.findings)
         known = start.shared_offsets, start.noise_freedom
         self.monitor.begin(start.state.time, findings, *known)
-        self.score.begin(start.score, start.state.time)
+        self.score.begin(start.score, start.state)
         self.recovery.detected_at = start.state.time
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.extra_lines]
         return self._judge_state(start.state, None).with_findings(*fitted)
@@ -210,7 +210,7 @@ class EpochUpdate:
             return
         state, offset = predicted.state, arrived.imu.offset
         imu = arrived.imu.measured(before.time - offset, state.time - offset)
-        self.score.predict(before, state, predicted.transition, imu)
+        self.score.predict(before, state, predicted.transition, predicted.noise, imu)
         self.score.measured(measurements, state, self.aiding.rejected)
 
     def _update_monitor(

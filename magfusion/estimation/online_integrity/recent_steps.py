@@ -67,8 +67,7 @@ class RecentSteps:
             information=np.pad(sums.information, (0, size)),
             gradient=np.pad(sums.gradient, (0, size)),
             response=np.concatenate([sums.response, response], axis=1),
-            cross_cov=np.pad(sums.cross_cov, ((0, 0), (0, size))),
-            excess=np.pad(sums.excess, (0, size)),
+            exact_response=np.concatenate([sums.exact_response, response], axis=1),
             onsets=(*sums.onsets, sums.time),
         )
         return new if len(new.onsets) <= MOST_ONSETS else self._without_one(new)
@@ -84,8 +83,7 @@ class RecentSteps:
             information=sums.information[np.ix_(kept, kept)],
             gradient=sums.gradient[kept],
             response=sums.response[:, kept],
-            cross_cov=sums.cross_cov[:, kept],
-            excess=sums.excess[np.ix_(kept, kept)],
+            exact_response=sums.exact_response[:, kept],
             onsets=sums.onsets[:dropped] + sums.onsets[dropped + 1 :],
         )
 

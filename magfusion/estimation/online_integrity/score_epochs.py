@@ -24,7 +24,6 @@ from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray
 
 MEMORY = 60.0  # s; older innovations count less, as faults may change
-ROUNDING = 1e-10  # of a covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,32 +31,19 @@ class Sums:
     """Sums over the innovations up to now, in typical errors of the fixed parameters.
 
     After these h parameters follow those of `magfusion.estimation.online_integrity.recent_steps`.
-    A filter whose gain considers uncertain parameters leaves errors in the state that appear in
-    successive innovations: they are correlated, given the parameters, and the gradient varies more
-    than its information.
+    A filter whose gain considers uncertain parameters has correlated innovations.  Those that are
+    summed are of the *exact* filter, which takes every fixed parameter as declared exactly: given
+    the parameters they are white, and the sums those of a batch solution.
     """
 
     information: Array  # (h + k, h + k)
     gradient: Array  # (h + k,)
     response: Array  # (15 + estimated, h + k), effect of a unit error of these on the state
     time: float  # (s)
-    cross_cov: Array  # (15 + estimated, h + k), covariance of the state's error with the gradient
-    excess: Array  # (h + k, h + k), covariance of the gradient beyond the information
+    exact_response: Array  # (15 + estimated, h + k), the same of the exact filter's state
+    exact_offset: Array  # (15 + estimated,), from the state to that of the exact filter
+    exact_cov: Array  # (15 + estimated, 15 + estimated), of the latter
     onsets: tuple[float, ...] = ()  # times of the tested steps (s)
-
-    def with_correlation(self, information: Array, gradient: Array) -> tuple[Array, Array]:
-        """Return information and gradient, (h + k, h + k) and (h + k,), as the noise allows.
-
-        The gradient is a measurement of the errors, ``information @ errors``; its covariance is the
-        information and the excess.
-        """
-        value, vector = np.linalg.eigh(0.5 * (self.excess + self.excess.T))
-        cov = information + (vector * np.maximum(value, 0.0)) @ vector.T
-        value, vector = np.linalg.eigh(cov)
-        known = value > ROUNDING * value[-1]
-        by = (vector[:, known] / np.sqrt(value[known])).T
-        whitened = by @ information
-        return whitened.T @ whitened, whitened.T @ (by @ gradient)
 
 
 class EpochTransition(NamedTuple):
@@ -68,6 +54,7 @@ class EpochTransition(NamedTuple):
     # gyro_body, accel_body: (3,), their means (rad/s, m/s^2); zero where nothing was measured
     gyro_body: Array
     accel_body: Array
+    noise: Array  # (n, n), covariance that the interval adds
 
 
 class Epoch(NamedTuple):
@@ -79,114 +66,99 @@ class Epoch(NamedTuple):
     rejected: tuple[Measurement, ...] = ()  # innovations that did not update the state
 
 
-def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> EpochTransition:
+def passed(
+    before: State, after: State, transition: Array, noise: Array, imu: ImuSamples
+) -> EpochTransition:
     """Return the propagation to a prediction, from the inertial samples of the interval."""
     gyro = accel = np.zeros(3)
     if len(imu):
         share = np.full(len(imu), 1.0 / len(imu))
         gyro, accel = share @ imu.gyro_body, share @ imu.accel_body
-    return EpochTransition(transition, (before.world_from_body, after.world_from_body), gyro, accel)
+    turn = before.world_from_body, after.world_from_body
+    return EpochTransition(transition, turn, gyro, accel, noise)
 
 
 def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Sums:
     """Return the sums with the innovations of some consecutive epochs."""
-    own, rest = slice(0, targets.size), targets.rest
+    own, fixed = slice(0, targets.size), slice(0, len(targets.unit))
     error, jacobian, is_used = _rows(epochs, targets)
     # Of hundreds of beacons few are detected: the rows of the others are empty.
     filled = np.any(error, axis=0) | np.any(jacobian, axis=(0, 2))
     error, jacobian, is_used = error[:, filled], jacobian[:, filled], is_used[:, filled]
     by_state = jacobian[..., : targets.whole]
     by_held = jacobian[..., targets.columns] * targets.unit
-    cov = np.array([epoch.predicted.cov for epoch in epochs])
-    by_own, sparse = by_state[..., own], [sparse_if_wide(rows) for rows in by_state]
-    across = np.array([rows @ one for rows, one in zip(sparse, cov, strict=True)])
-    spread = np.array([rows @ one.T for rows, one in zip(sparse, across, strict=True)])
-    # Rejected rows have no gain, and no part in that of the others.
-    both_used = is_used[:, :, None] * is_used[:, None, :]
-    updating = spread * both_used + np.eye(error.shape[1])
-    alone = cov[:, own, own]
-    if len(rest):
-        considered = cov[:, rest]
-        learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
-        alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
-    gain = np.swapaxes(np.linalg.solve(updating, across[..., own] * is_used[..., None]), 1, 2)
+    by_own, gain = by_state[..., own], _gain(epochs, by_state, is_used, own)
     pushed, response = _pushed(epochs, targets), sums.response
-    shown, fixed = np.empty((*error.shape, response.shape[1])), slice(0, len(targets.unit))
-    for k, epoch in enumerate(epochs):
-        if epoch.passed is not None:
-            response = epoch.passed.transition[own, own] @ response
-            response[:9, fixed] -= pushed[k]
-        shown[k] = by_own[k] @ response
-        shown[k][:, fixed] -= by_held[k]
-        response = response - gain[k] @ shown[k]
-    # The inverse of the innovations' covariance, which is one plus that of few states.
-    columns, back = np.concatenate([shown, error[..., None]], axis=2), np.swapaxes(by_own, 1, 2)
-    inner = np.eye(targets.size) + alone @ back @ by_own
-    solved = columns - by_own @ np.linalg.solve(inner, alone @ (back @ columns))
-    reported = np.swapaxes(shown, 1, 2) @ solved
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
-    whole = np.einsum("k,kij->ij", kept[1:], reported)
-    led = [None if one.passed is None else one.passed.transition[own, own] for one in epochs]
-    rows = by_own, alone, gain, shown, solved[..., :-1]
-    cross_cov, excess = _correlation(sums, led, *rows, kept)
+    exact_cov, information, gradient = sums.exact_cov, sums.information, sums.gradient
+    information, gradient = kept[0] * information, kept[0] * gradient
+    exact = np.column_stack([sums.exact_response, sums.exact_offset])
+    for k, epoch in enumerate(epochs):
+        if (propagation := epoch.passed) is not None:
+            transition = propagation.transition[own, own]
+            response, exact = transition @ response, transition @ exact
+            response[:, fixed] -= pushed[k]
+            exact[:, fixed] -= pushed[k]
+            exact_cov = transition @ exact_cov @ transition.T + propagation.noise[own, own]
+        shown, innovation = by_own[k] @ response, by_own[k] @ exact
+        shown[:, fixed] -= by_held[k]
+        innovation[:, fixed] -= by_held[k]
+        innovation[:, -1] += error[k]
+        white = innovation - by_own[k] @ _updated(exact_cov, by_own[k], innovation)
+        reported = kept[k + 1] * (innovation[:, :-1].T @ white)
+        information, gradient = information + reported[:, :-1], gradient + reported[:, -1]
+        response = response - gain[k] @ shown
+        used = by_own[k] * is_used[k, :, None]
+        exact = exact - _updated(exact_cov, used, innovation)
+        exact[:, -1] += gain[k] @ error[k]
+        exact_cov = exact_cov - _updated(exact_cov, used, used @ exact_cov)
     return replace(
         sums,
-        information=kept[0] * sums.information + whole[:, :-1],
-        gradient=kept[0] * sums.gradient + whole[:, -1],
+        information=information,
+        gradient=gradient,
         response=response,
         time=float(time[-1]),
-        cross_cov=cross_cov,
-        excess=excess,
+        exact_response=exact[:, :-1],
+        exact_offset=exact[:, -1],
+        exact_cov=0.5 * (exact_cov + exact_cov.T),
     )
 
 
-def _correlation(
-    sums: Sums,
-    transitions: Sequence[Array | None],
-    jacobian: Array,
-    cov: Array,
-    gain: Array,
-    shown: Array,
-    weight: Array,
-    kept: Array,
-) -> tuple[Array, Array]:
-    """Return `Sums.cross_cov` and `Sums.excess` after some epochs.
+def _updated(cov: Array, jacobian: Array, innovation: Array) -> Array:
+    """Return the gain of whitened rows (m, n) times columns of innovations, shape (n, columns)."""
+    across = cov @ jacobian.T
+    inner = np.eye(len(cov)) + across @ jacobian
+    return np.asarray(np.linalg.solve(inner, across @ innovation))
 
-    Parameters
-    ----------
-    transitions : sequence of ndarray or None
-        (n, n), of the state to each epoch; None where it was not propagated.
-    jacobian, cov, gain : ndarray
-        (epochs, m, n), (epochs, n, n), (epochs, n, m), of the rows by the state, of the state given
-        the parameters, and of the update.
-    shown, weight : ndarray, shape (epochs, m, h + k)
-        What a unit error shows in the innovations, and the same times their inverse covariance.
-    kept : ndarray, shape (epochs + 1,)
-        Weight of the sums before, and of each epoch.
+
+def _gain(epochs: Sequence[Epoch], by_state: Array, is_used: BoolArray, own: slice) -> Array:
+    """Return the gain of each update of the estimate, shape (epochs, n, m).
+
+    Rejected rows have no gain, and no part in that of the others.
     """
-    size = shown.shape[2]
-    cross_cov, appears = sums.cross_cov, np.empty_like(shown)
-    for k, transition in enumerate(transitions):
-        cross_cov = kept[k] / kept[k + 1] * cross_cov
-        if transition is not None:
-            cross_cov = transition @ cross_cov
-        appears[k] = jacobian[k] @ cross_cov
-        cross_cov = cross_cov + cov[k] @ (jacobian[k].T @ weight[k])
-        cross_cov = cross_cov - gain[k] @ (appears[k] + shown[k])
-    both = (kept[1:, None, None] * weight).reshape(-1, size).T @ appears.reshape(-1, size)
-    return cross_cov, kept[0] * sums.excess + both + both.T
+    cov = [epoch.predicted.cov for epoch in epochs]
+    sparse = [sparse_if_wide(rows) for rows in by_state]
+    across = np.array([rows @ one for rows, one in zip(sparse, cov, strict=True)])
+    spread = np.array([rows @ one.T for rows, one in zip(sparse, across, strict=True)])
+    both_used = is_used[:, :, None] * is_used[:, None, :]
+    updating = spread * both_used + np.eye(by_state.shape[1])
+    by_used = across[..., own] * is_used[..., None]
+    return np.asarray(np.swapaxes(np.linalg.solve(updating, by_used), 1, 2))
 
 
-def new_sums(information: Array, gradient: Array, response: Array, time: float) -> Sums:
-    """Return sums of innovations that are not correlated with the state's error."""
-    none = np.zeros_like(response), np.zeros_like(information)
-    return Sums(information, gradient, response, time, *none)
+def new_sums(information: Array, gradient: Array, response: Array, time: float, cov: Array) -> Sums:
+    """Return sums at a state of a known response, (n, h), whose filter is the exact one.
+
+    `cov` (n, n): of the state, given the parameters.
+    """
+    offset = np.zeros(len(response))
+    return Sums(information, gradient, response, time, response, offset, cov)
 
 
 def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:
-    """Return the effect of a unit error of the inertial sensors, to subtract, (epochs, 9, h)."""
-    out = np.zeros((len(epochs), 9, len(targets.unit)))
+    """Return the effect of a unit error of the inertial sensors, to subtract, (epochs, n, h)."""
+    out = np.zeros((len(epochs), targets.size, len(targets.unit)))
     rows = [k for k, epoch in enumerate(epochs) if epoch.passed is not None]
     led = [epoch.passed for epoch in epochs if epoch.passed is not None]
     if not led:
@@ -201,7 +173,7 @@ def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:
         if isinstance(block.parameter, Inertial):
             bias = block.parameter.as_bias(stream)
             bias = bias[::2] if block.parameter.of_states else bias
-            out[rows, :, block.columns] = by_bias @ (bias * targets.unit[block.columns])
+            out[rows, :9, block.columns] = by_bias @ (bias * targets.unit[block.columns])
     return out
 
 

@@ -109,10 +109,11 @@ class OnlineScore:
         steel = self._steel
         return ScoreTargets(site, estimated, considered, static=self._static, steel=steel)
 
-    def begin(self, score: Score | None, time: float) -> None:
-        """Continue from the score of the smoothed beginning, at its last state (s)."""
+    def begin(self, score: Score | None, state: State) -> None:
+        """Continue from the score of the smoothed beginning, at its last state."""
         if score is None:
             return
+        time = state.time
         if are_many(self.site):
             names = {b.owner for b in score.fixed if isinstance(b.parameter, BeaconParameter)}
             self._detected_at = {b.name: time for b in self.site.beacons if b.name in names}
@@ -121,7 +122,8 @@ class OnlineScore:
         if not shared or not targets.fixed_blocks:
             return
         response = -np.concatenate([score.by_state[-1], score.by_calibration])
-        self._sums = new_sums(score.information, score.gradient, response, time)
+        cov = _given_considered(state.cov, targets.size)
+        self._sums = new_sums(score.information, score.gradient, response, time, cov)
         self._waiting = []
 
     def end(self) -> None:
@@ -162,20 +164,28 @@ class OnlineScore:
         here, there = targets.among(before)
         information = np.zeros((len(targets.unit),) * 2)
         gradient, response = information[0].copy(), np.zeros((targets.size, len(targets.unit)))
+        exact = response.copy()
         information[np.ix_(here, here)] = sums.information[np.ix_(there, there)]
         gradient[here], response[:, here] = sums.gradient[there], sums.response[:, there]
-        own = np.ix_(here, here), np.ix_(there, there)
-        self._sums = new_sums(information, gradient, response, sums.time)
-        self._sums.excess[own[0]] = sums.excess[own[1]]
-        self._sums.cross_cov[:, here] = sums.cross_cov[:, there]
+        exact[:, here] = sums.exact_response[:, there]
+        self._sums = replace(
+            sums,
+            information=information,
+            gradient=gradient,
+            response=response,
+            exact_response=exact,
+            onsets=(),
+        )
 
-    def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
+    def predict(
+        self, before: State, after: State, transition: Array, noise: Array, imu: ImuSamples
+    ) -> None:
         """Propagate the response to a prediction.
 
-        `transition` (n, n): of the tangent. `imu`: of the interval.
+        `transition`, `noise` (n, n): of the tangent. `imu`: of the interval.
         """
         if self._sums is not None:
-            self._waiting.append(Epoch(after, passed(before, after, transition, imu)))
+            self._waiting.append(Epoch(after, passed(before, after, transition, noise, imu)))
 
     def measured(
         self,
@@ -240,9 +250,6 @@ class OnlineScore:
 
         self._result, self._evidence = (sums, score), None
         causes = list(causes_of(pose_cov, score, candidates))
-        if causes:
-            score = _correlated(sums, score)
-            causes = list(causes_of(pose_cov, score, candidates))
         self.correction, self.named = None, ()
         if targets.steel and (bent := self._steel_of(score, causes)) is not None:
             return bent
@@ -272,7 +279,7 @@ class OnlineScore:
         if self._result is None:
             return list(correction.rivals)
         if self._evidence is None:
-            self._evidence = _correlated(*self._result).with_declared(tolerance=False)
+            self._evidence = self._result[1].with_declared(tolerance=False)
         return open_rivals(correction, self.targets.fault_candidates, *self._evidence)
 
     def _steel_of(self, score: Score, named: Sequence[NamedCause]) -> Judgement | None:
@@ -289,7 +296,7 @@ class OnlineScore:
         return Judgement((estimate.finding(self.site),), turn=turn, shift=shift)
 
 
-def _correlated(sums: Sums, score: Score) -> Score:
-    """Return a score as the correlation of the innovations allows."""
-    information, gradient = sums.with_correlation(score.information, score.gradient)
-    return replace(score, information=information, gradient=gradient)
+def _given_considered(cov: Array, size: int) -> Array:
+    """Return the covariance of the first numbers of a state given the others, (size, size)."""
+    across = cov[size:, :size]
+    return np.asarray(cov[:size, :size] - across.T @ np.linalg.solve(cov[size:, size:], across))

@@ -60,8 +60,6 @@ class ScoreTargets:
         self.columns = np.concatenate([np.zeros(0, dtype=np.int64), *own])
         among = [b for b in considered if _is_of(b, self.names)]
         self.spread = self._declared(tuple(among))
-        # Columns of a state's tangent with the considered parameters of these beacons.
-        self.rest = _columns(among)
 
     @cached_property
     def fault_candidates(self) -> tuple[FaultCandidate, ...]:
@@ -138,8 +136,3 @@ def of_beacons_named(site: Site, names: Iterable[str]) -> Site:
 
 def _is_of(block: Block, names: tuple[str, ...]) -> bool:
     return not isinstance(block.parameter, BeaconParameter) or block.owner in names
-
-
-def _columns(blocks: Iterable[Block]) -> IntArray:
-    own = [np.arange(MOTION + b.columns.start, MOTION + b.columns.stop) for b in blocks]
-    return np.concatenate([np.zeros(0, dtype=np.int64), *own])
