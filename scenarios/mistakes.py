@@ -323,7 +323,7 @@ def _chosen(text: str | None, known: Sequence[str]) -> tuple[str, ...]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = scenario_parser(__doc__, Config.seed, output=None, parallel=True)
-    parser.add_argument("--mistakes", help="some of them, separated by commas, or a group's name")
+    parser.add_argument("--mistakes", help="some of them, or groups, separated by commas")
     parser.add_argument("--logs", help=f"of {','.join(LOGS)}")
     parser.add_argument("--estimators", help=f"of {','.join(ESTIMATORS)}")
     parser.add_argument("--texts", action="store_true", help="the first reason in full, too")
@@ -338,11 +338,10 @@ def main() -> None:
     if given.list:
         sys.stdout.write("\n".join(f"{m.group:6} {m.name}" for m in MISTAKES.values()) + "\n")
         return
-    groups = {m.group for m in MISTAKES.values()}
-    names = [m.name for m in MISTAKES.values() if given.mistakes not in groups]
-    names = names or [m.name for m in MISTAKES.values() if m.group == given.mistakes]
+    groups = sorted({m.group for m in MISTAKES.values()})
+    chosen = set(_chosen(given.mistakes, [*MISTAKES, *groups]))
     config = Config(
-        mistakes=_chosen(None if given.mistakes in groups else given.mistakes, names),
+        mistakes=tuple(m.name for m in MISTAKES.values() if {m.name, m.group} & chosen),
         logs=_chosen(given.logs, LOGS),
         estimators=_chosen(given.estimators, ESTIMATORS),
         seed=given.seed,
