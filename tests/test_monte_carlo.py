@@ -192,6 +192,29 @@ def test_tasks_wait_for_another_worker(
     assert capsys.readouterr().err.count("no worker is left") == 1
 
 
+def quit_once(given: tuple[Path, bool], rng: np.random.Generator) -> float:
+    mark, dies = given
+    if dies and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return rng.normal()
+
+
+@pytest.mark.slow
+def test_results_that_a_worker_takes_with_it_are_computed_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+    inputs = [(tmp_path / f"{i}", i % 20 == 19) for i in range(100)]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=ANY
+    ) as started:
+        result = run_many(quit_once, inputs, cluster=started.scheduler_address)
+    assert sum(mark.exists() for mark, _ in inputs) == 5
+    assert result == run_many(quit_once, inputs, workers=1)
+
+
 @pytest.mark.slow
 def test_a_scheduler_that_ends_is_named() -> None:
     distributed = pytest.importorskip("distributed")

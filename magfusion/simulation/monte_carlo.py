@@ -9,6 +9,7 @@ from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -77,7 +78,7 @@ def run_many(
 class WorkerPool:
     """Processes that persist over several calls, so that they are started once."""
 
-    executor: Executor | None  # None runs the tasks in this process
+    executor: "Executor | Client | None"  # None runs the tasks in this process
 
     def run(
         self,
@@ -133,22 +134,35 @@ def _here(
 
 
 def _gather(
-    executor: Executor,
+    executor: "Executor | Client",
     task: Callable[[Any, np.random.Generator], Output],
     given: list[tuple[Any, np.random.SeedSequence]],
     report_progress: Report,
 ) -> list[Output]:
-    futures = [executor.submit(_run, task, one, seed) for one, seed in given]
+    submit, completed = _interface(executor)
+    futures = [submit(_run, task, one, seed) for one, seed in given]
     report_progress("runs", 0, len(futures))
+    results: dict[Any, Output] = {}
     try:
-        for done, future in enumerate(as_completed(futures), start=1):
-            future.result()
-            report_progress("runs", done, len(futures))
+        for future in completed(futures):
+            results[future] = future.result()
+            report_progress("runs", len(results), len(futures))
     except BaseException:
         for future in futures:
             future.cancel()
         raise
-    return [future.result() for future in futures]
+    return [results[future] for future in futures]
+
+
+def _interface(executor: "Executor | Client") -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return how tasks are submitted, and iterated over as they are completed."""
+    if isinstance(executor, Executor):
+        return executor.submit, as_completed
+    # Not by Client.get_executor(), which fails where a result is lost with its worker.
+    from distributed import as_completed as completed_on_cluster
+
+    submit = partial(executor.submit, pure=False)  # equal inputs are separate runs
+    return submit, partial(completed_on_cluster, loop=executor.loop)
 
 
 def _end_with_parent() -> None:
@@ -185,7 +199,7 @@ def _processes(count: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Executor]:
+def _dask(address: str) -> Iterator["Client"]:
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker, NoWorkerError
@@ -208,11 +222,10 @@ def _dask(address: str) -> Iterator[Executor]:
                 f"--cluster {address}: the scheduler has no workers; start some with dask worker"
                 f" {address}"
             ) from error
-        # Equal inputs are separate runs.
-        executor, ended = client.get_executor(pure=False), Event()
+        ended = Event()
         Thread(target=_report_loss, args=(client, address, ended), daemon=True).start()
         try:
-            yield executor
+            yield client
         except (KilledWorker, NoWorkerError) as error:
             raise EstimationError(
                 f"--cluster {address}: its workers have ended, possibly for lack of memory; start"
@@ -224,7 +237,6 @@ def _dask(address: str) -> Iterator[Executor]:
             ) from error
         finally:
             ended.set()
-            executor.shutdown(wait=False)  # an interrupt must not wait for tasks
 
 
 def _report_loss(client: "Client", address: str, ended: Event) -> None:
