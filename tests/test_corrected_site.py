@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.change_detection import CHANGED, step_of
 from magfusion.estimation.integrity.corrected_site import (
     NO_GRAVITY,
     corrected_site,
+    with_bias_walk,
     with_intrinsics,
 )
 from magfusion.estimation.integrity.correction import Correction, released
@@ -18,17 +20,21 @@ from magfusion.estimation.integrity.fault_candidates import (
     TILT,
     TYPICAL_SHIFT,
     TYPICAL_TILT,
+    FaultCandidate,
     fault_candidates,
     fixed_blocks,
 )
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
 from magfusion.model.parameters.inertial import (
+    ACCEL_BIAS,
     GRAVITY,
     GYRO_ALIGNMENT,
     GYRO_BIAS,
     GYRO_G_SENSITIVITY,
     GYRO_SCALE,
+    Bias,
 )
 from magfusion.model.site import Location
 from magfusion.model.trust import Finding
@@ -160,6 +166,22 @@ def test_a_bias_beyond_its_sigma_is_declared_to_be_so_uncertain() -> None:
     step = fault.combine @ np.array([1.0, -4.0, 0.0])  # of 0.01 rad/s
     corrected = corrected_site(SITE, fault, step)
     assert changed_keys(SITE, corrected) == {"platform.imu.gyro_bias_sigma": pytest.approx(0.04)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "key"),
+    [(GYRO_BIAS, 0.014, "gyro_bias_walk"), (ACCEL_BIAS, 0.22, "accel_bias_walk")],
+)
+def test_a_bias_that_steps_may_change_by_so_much_in_a_second(
+    kind: Bias, size: float, key: str
+) -> None:
+    (block,) = placed([step_of(kind, "imu", 20.0)])
+    step = np.array([0.6, 0.0, -0.8]) * size / block.sigma
+    fault = FaultCandidate("the bias", (block,), np.eye(3), CHANGED)
+    known = np.eye(3), np.ones(3), step, 100.0, 3
+    cause = ReleasedFault(fault, step, *known, np.zeros((1, 6)), np.zeros(1))
+    changed = changed_keys(SITE, with_bias_walk(SITE, cause))
+    assert changed == {f"platform.imu.{key}": pytest.approx(size)}  # per sqrt(s)
 
 
 def test_drifts_of_all_beacons_alike_are_the_magnetometers_clock() -> None:

@@ -142,12 +142,17 @@ def test_units_signs_biases_and_frames_are_undone_and_their_remedies_work(
 
 
 @pytest.mark.slow
-def test_a_bias_that_jumps_is_named_online_and_covered() -> None:
-    few = Config(("gyro_bias_steps", "accel_bias_steps"), ("moving",), ("ekf",))
-    for row in run(few, {"workers": 1})[1:]:
-        assert row.codes[0] == "changed", row.mistake
+@pytest.mark.parametrize("estimator", ["smooth", "ekf"])
+def test_a_bias_that_jumps_is_followed(estimator: str) -> None:
+    mistakes = ("gyro_bias_steps", "accel_bias_steps")
+    good, *rows = run(Config(mistakes, ("moving",), (estimator,), remedies=True), {"workers": 1})
+    for row in rows:
+        assert row.codes == ("changed",), row.mistake
+        assert row.error_m < 2.0 * good.error_m, row.mistake
+        assert row.claimed_m < 2.0 * good.claimed_m, row.mistake
         assert row.nees is not None
-        assert 1.0 < row.nees < 12.6  # 95 % of chi square of six
+        assert 1.0 < row.nees < 12.6, row.mistake  # 95 % of chi square of six
+        assert row.remedy == "works", row.mistake
 
 
 @pytest.mark.slow

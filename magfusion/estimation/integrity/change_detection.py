@@ -175,7 +175,7 @@ def changed(case: Case) -> TestResult:
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     certain = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
     finding = change_finding(cause, prior_sigma(every))
-    return TestResult((finding,), spread=moved + certain, gain=cause.gain)
+    return TestResult((finding,), spread=moved + certain, causes=(cause,), gain=cause.gain)
 
 
 def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestResult | None:
@@ -329,7 +329,7 @@ def change_finding(cause: ReleasedFault, sigma: Array) -> Finding:
     elif kind in (STAMPS, TIME_OFFSET):
         remedy = "the source of the stamps, and samples lost there"
     elif isinstance(kind, Bias):
-        remedy = "its temperature, and whether it had a shock"
+        remedy = "its temperature, and whether it had a shock, or increase its bias_walk"
     elif kind == SENSOR_ROTATION:
         remedy = "its mounting"
     else:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.change_detection import SinceBias
 from magfusion.estimation.integrity.fault_candidates import (
     SAMPLE_RATE,
     STRETCH,
@@ -41,6 +42,7 @@ from magfusion.units import Array
 
 PER_CENT = 0.01
 EYE, NOTHING = np.eye(3), np.zeros((3, 3))
+STEP_DURATION = 1.0  # s, in which a bias of one step is within the sigma of its random walk
 NO_GRAVITY = 1e-3  # m/s^2, that a site declares where gravity was removed from the data
 
 
@@ -148,6 +150,17 @@ def corrected_by(site: Site, cause: ReleasedFault) -> Site:
         return replace(beacon, sigma=replace(beacon.sigma, position_world=sigma))
 
     return replace(result, beacons=tuple(widened(beacon) for beacon in result.beacons))
+
+
+def with_bias_walk(site: Site, cause: ReleasedFault) -> Site:
+    """Return a site whose IMU bias may change as a step of it did; others as declared."""
+    block = cause.fault.blocks[0]
+    if not isinstance(block.parameter, SinceBias):
+        return site
+    name = "gyro_bias_walk" if block.parameter.of == GYRO_BIAS else "accel_bias_walk"
+    size = float(np.linalg.norm(block.sigma * cause.step[block.columns]))
+    walk = max(size / np.sqrt(STEP_DURATION), getattr(site.platform.imu, name))
+    return with_imu(site, **{name: float(f"{walk:.2g}")})
 
 
 def released_blocks(fault: FaultCandidate) -> tuple[Block, ...]:

@@ -15,6 +15,7 @@ from magfusion.estimation.integrity.corrected_site import (
     estimated_blocks,
     released_blocks,
     wide_sigmas,
+    with_bias_walk,
     with_sigmas,
 )
 from magfusion.estimation.integrity.fault_candidates import (
@@ -114,7 +115,9 @@ def corrections(
     if diagnosis is not None and diagnosis.finding.code == QUANTISED:
         return result  # no parameter undoes what steps distort
     finding = next((f for f in findings if causes and f.code == causes[0].code), None)
-    if finding is not None:
+    if finding is not None and finding.code == CHANGED:
+        result.append(Correction(finding, with_bias_walk(site, causes[0])))
+    elif finding is not None:
         result.append(_by_score(site, finding, *causes))
     if diagnosis is not None and diagnosis.site is not None:
         by_snapshots = _by_snapshots(site, diagnosis)

@@ -15,6 +15,7 @@ import numpy as np
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.estimation.integrity.change_detection import CHANGED, change_finding
+from magfusion.estimation.integrity.corrected_site import with_bias_walk
 from magfusion.estimation.integrity.correction import Correction, Rival, corrections, open_rivals
 from magfusion.estimation.integrity.fault_candidates import FaultCandidate
 from magfusion.estimation.integrity.fixed_parameter_test import (
@@ -260,6 +261,8 @@ class OnlineScore:
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
         if cause.code == CHANGED:
             finding = change_finding(cause, prior_sigma(score.fixed))
+            if (site := with_bias_walk(self.site, cause)) is not self.site:
+                self.correction = Correction(finding, site)
             return Judgement((finding,), turn=float(turn), shift=float(shift))
         self.correction = self._correction_of(score, cause, rivals)
         return Judgement((self.correction.finding,), turn=float(turn), shift=float(shift))
