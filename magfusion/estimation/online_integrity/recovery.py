@@ -92,7 +92,8 @@ def at_fix(state: State, fix: AgreedFix) -> State:
 def restarted(state: State, fix: AgreedFix) -> State:
     """Return a state with the pose of a fix alone; calibration is kept.
 
-    So are the biases, unless they are implausible for the instrument, or its prior is better.
+    So are the biases that are plausible for the instrument, as uncertain as declared: one that
+    jumped may be why the platform was lost.
     """
     best, site = fix.fixes.best(), state.calibration.site
     assert best.pose_cov is not None
@@ -102,23 +103,16 @@ def restarted(state: State, fix: AgreedFix) -> State:
     cov[6:9, 6:9] = site.platform.motion.speed_sigma**2 * np.eye(3)
     result = replace(at_fix(state, fix), velocity_world=np.zeros(3), cov=cov)
     imu = site.platform.imu
-    if _is_worse(state.accel_bias_body, cov[ACCEL_BIAS, ACCEL_BIAS], imu.accel_bias_sigma):
-        result = replace(result, accel_bias_body=np.zeros(3))
-        _reset_covariance(cov, ACCEL_BIAS, imu.accel_bias_sigma)
-    if _is_worse(state.gyro_bias_body, cov[GYRO_BIAS, GYRO_BIAS], imu.gyro_bias_sigma):
-        result = replace(result, gyro_bias_body=np.zeros(3))
-        _reset_covariance(cov, GYRO_BIAS, imu.gyro_bias_sigma)
-    return result
+    accel = _plausible(state.accel_bias_body, cov, ACCEL_BIAS, imu.accel_bias_sigma)
+    gyro = _plausible(state.gyro_bias_body, cov, GYRO_BIAS, imu.gyro_bias_sigma)
+    return replace(result, accel_bias_body=accel, gyro_bias_body=gyro)
 
 
-def _is_worse(bias: Array, cov: Array, sigma: float) -> bool:
-    """Return whether a bias is less plausible, or less certain, than a prior of zero."""
-    return bool(np.max(np.abs(bias)) > BIAS_LIMIT * sigma or np.max(np.diagonal(cov)) > sigma**2)
-
-
-def _reset_covariance(cov: Array, columns: slice, sigma: float) -> None:
+def _plausible(bias: Array, cov: Array, columns: slice, sigma: float) -> Array:
+    """Return a bias, or zero where it is implausible; its covariance becomes the declared one."""
     cov[columns] = cov[:, columns] = 0.0
     cov[columns, columns] = sigma**2 * np.eye(3)
+    return np.zeros(3) if np.max(np.abs(bias)) > BIAS_LIMIT * sigma else bias
 
 
 def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) -> bool:
