@@ -56,7 +56,6 @@ BEACONS, VEHICLES = 60, 3
 SPACING = 6.0  # m, of the beacons, in rows of five
 MOMENT = 20.0  # A m^2: received up to some 15 m
 NOISE = 3e-10  # T; of each part of a phasor
-DURATION = 8.0  # s, of a drive
 PART = 4.0  # m, half the side of the part of the hall that a log covers
 # Centres (m) of the parts, shape (16, 2).
 PARTS = np.stack(np.meshgrid(np.linspace(4.0, 62.0, 8), [6.0, 18.0]), axis=-1).reshape(-1, 2)
@@ -83,6 +82,7 @@ class Drive:
     path: Path
     day: float
     centre: Array
+    duration: float  # s
 
 
 def surveyed(rng: np.random.Generator) -> Site:
@@ -147,9 +147,9 @@ def driven(given: Drive, rng: np.random.Generator) -> None:
     """Write a short drive through a part of the hall, as phasors."""
     low, high = given.centre - PART, given.centre + PART
     box = np.array([[*low, 0.8], [*high, 1.6]])
-    config = SimulationConfig(box, duration=DURATION, perturb=False, magnetometer_rate_hz=500.0)
+    config = SimulationConfig(box, duration=given.duration, perturb=False, magnetometer_rate_hz=500.0)
     built = simulate_log(given.true, config, rng)
-    epochs = built.motion.trajectory(np.arange(0.3, DURATION - 0.3, 0.25))
+    epochs = built.motion.trajectory(np.arange(0.3, given.duration - 0.3, 0.25))
     fields = simulate_fields(built.true_site, epochs, NOISE, rng, built.drives, window=0.2)
     epoch_ns = int((BEGIN + DAY * given.day) * 1e9)
     write_log(replace(built.log, waveform=None, fields=fields, epoch_ns=epoch_ns), given.path)
@@ -230,6 +230,7 @@ def main() -> None:
     """Print what was found; end with one JSON line."""
     parser = scenario_parser(__doc__, seed=0, output=None, parallel=True)
     parser.add_argument("--logs", type=int, default=100, help="of them all")
+    parser.add_argument("--duration", type=float, default=8.0, help="of a drive, s")
     parser.add_argument("--real", type=int, default=16, help="simulated as drives, and smoothed")
     options = parser.parse_args()
     if options.real < len(PARTS):
@@ -263,7 +264,7 @@ def main() -> None:
         for i in range(real):
             centre = PARTS[i % len(PARTS)]
             now = at_day(vehicles[vehicle[i]], changes, days[i])
-            drives.append(Drive(now, place / f"log{i}", days[i], centre))
+            drives.append(Drive(now, place / f"log{i}", days[i], centre, options.duration))
         hands.run(driven, drives, seed=1)
         jobs = [Job(d.path, sites[v], place / "out") for d, v in zip(drives, vehicle, strict=False)]
         tasks: list[LogTask] = tasks_of(jobs, SETTINGS, place / "out")
