@@ -147,7 +147,9 @@ def driven(given: Drive, rng: np.random.Generator) -> None:
     """Write a short drive through a part of the hall, as phasors."""
     low, high = given.centre - PART, given.centre + PART
     box = np.array([[*low, 0.8], [*high, 1.6]])
-    config = SimulationConfig(box, duration=given.duration, perturb=False, magnetometer_rate_hz=500.0)
+    config = SimulationConfig(
+        box, duration=given.duration, perturb=False, magnetometer_rate_hz=500.0
+    )
     built = simulate_log(given.true, config, rng)
     epochs = built.motion.trajectory(np.arange(0.3, given.duration - 0.3, 0.25))
     fields = simulate_fields(built.true_site, epochs, NOISE, rng, built.drives, window=0.2)
