@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.graph.measurement import Measurement
-from magfusion.estimation.graph.state import MOTION, State
+from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.linearization import relinearized
+from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
-from magfusion.estimation.online_integrity.score_epochs import MEMORY
+from magfusion.estimation.online_integrity.score_epochs import MEMORY, _linearized
 from magfusion.estimation.online_integrity.score_online import OnlineScore
+from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.log import simulate_fields
+from magfusion.units import Array
 
 NOW = np.zeros(1, dtype=np.int64)
 STEP = 0.4  # s
@@ -44,7 +46,7 @@ def state_at(site: Site, time: float, rng: np.random.Generator) -> State:
 
 def phasors_at(
     state: State, site: Site, detected: list[int], rng: np.random.Generator
-) -> Measurement:
+) -> FieldPhasors:
     at = np.array([state.time]), state.world_from_body[None], state.position_world[None]
     poses = Trajectory(*at)
     samples = simulate_fields(site, poses, 1e-9, rng)
@@ -102,6 +104,30 @@ def test_who_comes_later_is_asked_as_if_it_had_been_there_all_the_time() -> None
     np.testing.assert_allclose(part.response[:, here], whole.response[:, there], atol=1e-12)
     silent = np.setdiff1d(np.arange(len(whole.gradient)), there)
     assert not np.any(whole.information[silent])
+
+
+def test_undetected_beacons_have_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, detected, solve = np.random.default_rng(5), [0, 1, 2], np.linalg.solve
+    site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
+    state, sizes = state_at(site, 0.0, rng), list[int]()
+
+    def recorded(matrix: Array, right: Array) -> Array:
+        sizes.append(len(matrix))
+        return np.asarray(solve(matrix, right))
+
+    epoch = phasors_at(state, site, detected, rng)
+    with monkeypatch.context() as patch:
+        patch.setattr(np.linalg, "solve", recorded)
+        assert relinearized(epoch, state, ()) is not None
+    assert max(sizes) <= 6 * len(detected)
+    targets = ScoreTargets(site, (), (), static=False)
+    rows = _linearized([epoch], [state], targets)
+    every = epoch.linearize(states_of([state]), state.calibration, targets.parameters)
+    np.testing.assert_array_equal(rows.error, every.error[:, detected])
+    assert rows.by_calibration is not None
+    assert every.by_calibration is not None
+    np.testing.assert_array_equal(rows.by_calibration, every.by_calibration[:, detected])
+    assert np.count_nonzero(every.by_calibration) == np.count_nonzero(rows.by_calibration)
 
 
 def test_nobody_is_asked_of_long_after_it_was_heard() -> None:

@@ -1,6 +1,7 @@
 """Steel near the path: its modes are fields of steel, and its evidence is a likelihood."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,21 @@ def test_noise_alone_is_no_steel() -> None:
         )
     assert np.mean(gains) < 0.0
     assert np.max(gains) < 10.0
+
+
+def test_modes_take_little_more_memory_than_the_distortions_of_their_voxels() -> None:
+    rng = np.random.default_rng(0)
+    place, tones, voxels = 10, 8, 1200
+    tensors = rng.standard_normal((place, voxels, 3, 3))
+    at_place, moment = (
+        rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+        for shape in ((place, tones, 3), (voxels, tones, 3, 6))
+    )
+    tracemalloc.start()
+    steel._modes(tensors, at_place, moment, 40)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.6 * (2 * place * tones * 3 * voxels * 6 * 8)
 
 
 def test_modes_of_a_region_have_no_curl_and_act_as_those_of_a_path() -> None:

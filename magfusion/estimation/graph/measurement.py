@@ -85,6 +85,11 @@ class Rows:
         by = (self.by_pose, self.by_velocity, self.by_bias, self.by_calibration)
         return Rows(share[..., 0] * self.error, *(b if b is None else share * b for b in by)), rho
 
+    def of_groups(self, kept: BoolArray) -> "Rows":
+        """Return the rows of some groups, shape (groups,)."""
+        by = (self.by_pose, self.by_velocity, self.by_bias, self.by_calibration)
+        return Rows(self.error[:, kept], *(b if b is None else b[:, kept] for b in by))
+
     def jacobian(self, calibration: int) -> Array:
         """Return all derivatives, shape (n, groups, components, 15 + calibration)."""
         out = np.zeros((*self.error.shape, MOTION + calibration))

@@ -52,10 +52,12 @@ def _step(phasors: FieldPhasors, predicted: State, blocks: tuple[Block, ...]) ->
     rows = phasors.linearize(states_of([predicted]), predicted.calibration, blocks)
     size = len(predicted.cov)
     jacobian = rows.jacobian(size - MOTION).reshape(-1, size)
+    detected = np.any(jacobian, axis=1)  # rows of undetected beacons are zero
+    error, jacobian = rows.error.reshape(-1)[detected], jacobian[detected]
     crossed = predicted.cov @ jacobian.T
     innovation_cov = jacobian @ crossed + np.eye(len(jacobian))
     gain = np.linalg.solve(innovation_cov, crossed[:6].T).T
-    return np.asarray(-gain @ rows.error.reshape(-1))
+    return np.asarray(-gain @ error)
 
 
 def _deviation(phasors: FieldPhasors, rotated: float, shifted: float, nearest: float) -> float:

@@ -131,9 +131,11 @@ class FieldPhasors(Measurement):
         """Return whitened columns of blocks; of many, only those that affect each channel."""
         if by_blocks.shape[-1] < MANY_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
-        out, root = np.zeros_like(by_blocks), self.sqrt_information
-        affected = _affected_columns(blocks, {name for name, _ in site.channels})
-        for k, (name, _) in enumerate(site.channels):
+        out, root = np.zeros(by_blocks.shape), self.sqrt_information
+        detected = np.flatnonzero(np.any(root, axis=(0, 2, 3))).tolist()
+        owner = {k: site.channels[k][0] for k in detected}
+        affected = _affected_columns(blocks, set(owner.values()))
+        for k, name in owner.items():
             for begin, end in affected[name]:
                 out[:, k, :, begin:end] = root[:, k] @ by_blocks[:, k, :, begin:end]
         return out

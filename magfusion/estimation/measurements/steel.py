@@ -332,13 +332,16 @@ def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> 
     by a sigma of each of its k independent amplitudes.
     """
     size = np.linalg.norm(at_place, axis=2)[..., None]
-    relative = np.stack(
-        [tensors @ moment[:, tone] / size[:, [tone], None] for tone in range(moment.shape[1])],
-        axis=1,
-    )
-    unit = float(np.sqrt(np.sum(np.abs(relative) ** 2) / size.size))
-    flat = np.moveaxis(relative, 3, 2).reshape(3 * size.size, -1)
-    flat = np.concatenate([flat.real, flat.imag]) if np.iscomplexobj(flat) else flat
+    (count_places, tones), (voxels, _, _, columns) = at_place.shape[:2], moment.shape
+    parts = (np.real, np.imag) if np.iscomplexobj(moment) else (np.real,)
+    # The largest array of a running estimate, of which there are no copies.
+    relative = np.empty((len(parts), count_places, tones, 3, voxels, columns))
+    for tone in range(tones):
+        own = np.swapaxes(tensors @ moment[:, tone] / size[:, [tone], None], 1, 2)
+        for k, part in enumerate(parts):
+            relative[k, :, tone] = part(own)
+    flat = relative.reshape(-1, voxels * columns)
+    unit = float(np.linalg.norm(flat) / np.sqrt(size.size))
     last = len(flat) - 1
     value, vector = eigh(flat @ flat.T, subset_by_index=(max(last + 1 - count, 0), last))
     kept = np.flatnonzero(value > 1e-9 * value[-1])[::-1]

@@ -248,7 +248,8 @@ def _linearized(parts: list[Measurement], states: list[State], targets: ScoreTar
     if isinstance(whole, FieldPhasors):
         for block in targets.steel:
             rows = _with_steel(rows, whole, at, calibration, block)
-    return rows.weighed(whole.loss)[0]
+    rows, predicted = rows.weighed(whole.loss)[0], whole.predicted_groups()
+    return rows if predicted is None else rows.of_groups(np.any(predicted, axis=0))
 
 
 def _with_steel(
