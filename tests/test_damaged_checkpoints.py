@@ -30,6 +30,7 @@ from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import Log
 from magfusion.simulation.demo_site import demo_site
+from magfusion.units import Array
 
 START = (
     100  # bytes before the content: magic 16, version 4, position 8, key 32, length 8, digest 32
@@ -311,3 +312,26 @@ def test_a_file_is_named_though_its_name_is_part_of_a_word() -> None:
         raise InputError("channels do not fit")
     with pytest.raises(InputError, match=r"^log/c: is damaged$"), named(Path("log/c")):
         raise InputError("log/c: is damaged")
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, np.array([0.0, 1e300])])
+def test_a_number_that_no_state_has_is_refused(value: Any) -> None:
+    kind = Array if isinstance(value, np.ndarray) else float
+    with pytest.raises(InputError, match=r"state\.x is beyond 1e\+100; run without --resume"):
+        from_plain(kind, value, "state.x")
+    assert from_plain(float, float("-inf"), "state.x") == float("-inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("usual", 0.0), ("usual", 1e-9), ("offset", 1e9), ("last_epoch", np.nan)]
+)
+def test_an_inertial_stream_of_no_rate_is_refused(
+    name: str, value: float, stream: Interrupted, tmp_path: Path
+) -> None:
+    state = read_checkpoint(stream.place)
+    assert state is not None
+    arrived = state.content["navigator"]["parts"]["_loop"]["arrived"]
+    (arrived if name in arrived else arrived["imu"])[name] = value
+    (scratch := tmp_path / "scratch").touch()
+    write_checkpoint(state, scratch)
+    assert "an invalid " in refused(stream, stream.place, scratch.read_bytes(), tmp_path)

@@ -265,3 +265,23 @@ def test_numbers_of_a_wrong_unit_are_refused_and_not_left_out(tmp_path: Path) ->
     write_log(replace(log, waveform=nanotesla), tmp_path / "log")
     with pytest.raises(InputError, match="another unit"):
         open_log(tmp_path / "log")
+
+
+@pytest.mark.parametrize("size", [6.0, -35.0, 1e4, 1e19])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [900, 901],
+        [900, 901, 902],
+        list(range(900, 908)),
+        [900, 902, 904],
+        [300, 301, 310, 700, 701, 702],
+    ],
+)
+@pytest.mark.parametrize("stream", STREAMS)
+def test_false_samples_in_a_row_are_left_out(stream: str, rows: list[int], size: float) -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    good = clean_log(with_spikes(log, stream, rows, size, axis=2), site)
+    assert missing_rows(log, good, stream) == rows
+    (finding,) = good.findings
+    assert f" {len(rows)} isolated samples" in finding.text

@@ -62,3 +62,17 @@ def test_allan_names_the_axes_of_a_simulator(
     report = _report(capfd, "allan", RECORDINGS / "allan_of_a_simulator", "-o", tmp_path / "out")
     assert "axes x, y, z without noise" in json.dumps(report["reasons"])
     assert report["gyro_noise"] == pytest.approx(1e-3, rel=0.05)  # 0.01 rad/s at 100 Hz
+
+
+@pytest.mark.slow
+def test_biases_that_do_not_walk_are_a_legitimate_model(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = RECORDINGS / "bias_walk_zero"
+    assert _report(capfd, "check", log)["verdict"] == "trustworthy"
+    out = tmp_path / "run"
+    assert _report(capfd, "smooth", log, "-o", out)["verdict"] == "trustworthy"
+    compared = _report(capfd, "evaluate", out, TRUTH / "truth_10hz.tum")
+    ate = compared["ate_m"]
+    assert isinstance(ate, float)
+    assert ate < 0.02  # m

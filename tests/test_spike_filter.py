@@ -22,7 +22,15 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import DEGREE, Array
 
-ROWS = [700], [900, 902], [2, 2397], list(range(40, 1000, 120))
+ROWS = (
+    [700],
+    [900, 902],
+    [900, 901],
+    [900, 901, 902],
+    list(range(900, 908)),
+    [2, 2397],
+    list(range(40, 1000, 120)),
+)
 
 
 def streamed(

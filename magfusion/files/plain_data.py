@@ -15,6 +15,8 @@ import numpy as np
 from magfusion.errors import InputError
 
 Kind = TypeVar("Kind")
+LARGEST = 1e100  # its square is a number, too
+_TOO_LARGE = f"is beyond {LARGEST:g}"
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ def _as_it_is(kind: Any, data: Any) -> Any:
         dtype = np.dtype(get_args(get_args(kind)[1])[0])
         if not isinstance(data, np.ndarray) or data.dtype != dtype:
             raise ValueError(f"is no array of {dtype}")
+        if np.issubdtype(dtype, np.inexact) and np.any(np.abs(data[np.isfinite(data)]) > LARGEST):
+            raise ValueError(_TOO_LARGE)
         return data
     if get_origin(kind) is Literal:
         if type(data) not in (str, int) or data not in get_args(kind):
@@ -97,6 +101,8 @@ def _as_it_is(kind: Any, data: Any) -> Any:
         return data
     if type(data) is not kind and not (kind is float and type(data) is int):
         raise ValueError(f"is no {kind.__name__}")
+    if kind is float and LARGEST < abs(data) < np.inf:
+        raise ValueError(_TOO_LARGE)
     return None if data is None else kind(data)
 
 

@@ -22,6 +22,7 @@ from magfusion.files.plausible import declared_range, reaches
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.false_runs import MAX_RUN, false_runs
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -36,6 +37,7 @@ AT_END = 0.9  # of the largest value
 SLOW = 0.1  # of it; steps of an axis that follows the field or the motion
 LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
 SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
+MAX_PASSES = 8
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
 # Deviations over the differences of the neighbours, and of all but an outer one that may be false.
 AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
@@ -343,7 +345,28 @@ def false_rows(stream: InstrumentStream, site: Site | None) -> IntArray:
     if not is_predictable(stream, site):
         return np.zeros(0, dtype=np.int64)
     rows, certain = _spikes(stream)
-    return rows[certain] if are_few(len(rows), len(stream.value)) else rows
+    result = rows[certain] if are_few(len(rows), len(stream.value)) else rows
+    for _ in range(MAX_PASSES):  # what one sample hides is seen without it
+        kept = np.delete(np.arange(len(stream.time)), result)
+        one = stream._replace(time=stream.time[kept], value=stream.value[kept])
+        rows, certain = _spikes(one)
+        reach = [np.searchsorted(result, kept[rows] + k) for k in (-MAX_RUN, MAX_RUN)]
+        certain |= reach[0] < reach[1]  # near another
+        more = kept[np.union1d(rows[certain], _false_runs(one))]
+        if not len(more):
+            break
+        result = np.union1d(result, more)
+    return result
+
+
+def _false_runs(stream: InstrumentStream) -> IntArray:
+    """Return the runs of false samples in a stream."""
+    time, x = stream.time, stream.value
+    if len(x) < 2 * BLOCK:
+        return np.zeros(0, dtype=np.int64)
+    step = float(np.median(np.diff(time)))
+    scatter = np.maximum(_scatter(deviations(time, x, step).residual), step_of_axes(x))
+    return false_runs(time, x, step, CERTAIN_SPIKE * scatter)[0]
 
 
 def are_few(spikes: int, samples: int) -> bool:
@@ -373,7 +396,9 @@ def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         if len(rows) == 0:
             continue
         x = stream.value
-        before, after = np.abs(rows - 1), np.where(rows + 1 < len(x), rows + 1, rows - 1)
+        good = np.delete(np.arange(len(x)), rows)
+        place = np.searchsorted(good, rows)
+        before, after = good[np.maximum(place - 1, 0)], good[np.minimum(place, len(good) - 1)]
         off = np.abs(x[rows] - 0.5 * (x[before] + x[after])) * stream.scale
         yield Finding(
             "false_samples" if stream.name == "magnetometer" else "imu_spikes",

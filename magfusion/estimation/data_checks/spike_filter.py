@@ -6,6 +6,7 @@ from magfusion.estimation.data_checks.inertial_noise import BLOCK
 from magfusion.estimation.data_checks.resolution import step_of_axes
 from magfusion.estimation.data_checks.samples import (
     CERTAIN_SPIKE,
+    MAX_PASSES,
     SPIKE,
     InstrumentStream,
     are_few,
@@ -13,6 +14,7 @@ from magfusion.estimation.data_checks.samples import (
     is_predictable,
 )
 from magfusion.model.site import Site
+from magfusion.receiver.false_runs import false_runs
 from magfusion.units import Array, BoolArray
 
 REACH = 2  # samples after one that its test needs, and as many before
@@ -26,7 +28,8 @@ PREDICTOR = np.array([-1.0, 4.0, -6.0, 4.0])  # the cubic through four even samp
 class SpikeFilter:
     """Leaves isolated false samples out of a stream.
 
-    A sample that those before it predict passes at once; another waits for the next two.
+    A sample that those before it predict passes at once; another waits for the next two, and one
+    that may begin a run of false samples for the end of that.
     `instruments`: of three columns each, as in `InstrumentStream`. `patient`: whether the first
     samples wait until they can be tested. `left_out`: false samples so far.
     """
@@ -69,20 +72,38 @@ class SpikeFilter:
         rows = np.concatenate([self._rows[len(self._rows) - before :], self._waiting[1]])
         decided = len(time)
         if len(time) > len(PREDICTOR) and self._unpredicted(rows).any():
-            false = deviations(time, rows, self._step).size(self._scatter) > self._threshold
-            false[:before] = False
-            if not final:
-                false[-REACH:] = False
-            self.left_out += int(np.sum(false))
-            time, rows = time[~false], rows[~false]
+            time, rows, open_row = self._without_false(time, rows, before, final=final)
             decided = len(time)
             if not final:
                 late = np.flatnonzero(self._unpredicted(rows)[-REACH:])
                 decided -= REACH - int(late[0]) if len(late) else 0
+                decided = max(before, min(decided, open_row))
         self._waiting = time[decided:], rows[decided:]
         passed = time[before:decided], rows[before:decided]
         self._keep(*passed)
         return passed
+
+    def _without_false(
+        self, time: Array, rows: Array, before: int, *, final: bool
+    ) -> tuple[Array, Array, int]:
+        """Return the samples that pass, and the first that may begin a run of false ones.
+
+        `before`: how many of the first passed earlier.
+        """
+        open_row = len(time)
+        for _ in range(MAX_PASSES):
+            false = deviations(time, rows, self._step).size(self._scatter) > self._threshold
+            if not final:
+                false[-REACH:] = False
+            least = np.broadcast_to(CERTAIN_SPIKE * self._scatter, rows.shape)
+            several, open_row = false_runs(time, rows, self._step, least)
+            false[several] = True
+            false[:before] = False
+            self.left_out += int(np.sum(false))
+            time, rows = time[~false], rows[~false]
+            if not false.any() or len(time) <= len(PREDICTOR):
+                break
+        return time, rows, open_row
 
     def _unpredicted(self, rows: Array) -> BoolArray:
         """Return which samples differ from what those before them predict, shape (n,)."""

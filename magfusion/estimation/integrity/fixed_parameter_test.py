@@ -126,7 +126,7 @@ def simplest(ranked: list[ReleasedFault]) -> ReleasedFault:
     """Return the part of the first cause with the fewest parameters that explains a log as well."""
     own = _keys(ranked[0])
     parts = (one for one in _as_likely(ranked) if _keys(one) <= own)
-    return min(parts, key=lambda one: one.fault.combine.shape[1])
+    return min(parts, key=lambda one: one.fault.combine.shape[1], default=ranked[0])
 
 
 def rivals_of(cause: ReleasedFault, ranked: list[ReleasedFault]) -> list[ReleasedFault]:

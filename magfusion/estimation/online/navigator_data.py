@@ -27,6 +27,8 @@ from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online.fixed_lag import Node, SlidingWindow
+from magfusion.estimation.online.queue.arrivals import Arrivals
+from magfusion.estimation.online.queue.inertial_stream import InertialStream
 from magfusion.estimation.online.window_prior import WindowPrior
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
@@ -51,6 +53,8 @@ MEASUREMENTS: tuple[type[Measurement], ...] = (
     PoseFix,
     *OF_AIDING.values(),
 )
+LARGEST_OFFSET = 1e5  # s, of the IMU's stamps
+SHORTEST_INTERVAL = 1e-5  # s, of inertial samples
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 
@@ -104,6 +108,8 @@ def navigator_rules(
             Node: lambda node: _check_node(node, blocks),
             WindowPrior: lambda prior: _check_prior(prior, size),
             Buffer: _check_buffer,
+            InertialStream: _check_inertial,
+            Arrivals: lambda a: require(a.last_epoch < np.inf, "has an invalid last epoch"),
             Bursts: _check_bursts,
             FieldSamples: lambda f: require(f.channels == site.channels, "has other channels"),
             SlidingWindow: lambda window: _check_window(window),
@@ -220,6 +226,12 @@ def _check_buffer(buffer: Buffer) -> None:
     require(time.ndim == 1 and rows.shape == (len(time), buffer.width), "has another shape")
     require(np.all(np.isfinite(time)) and np.all(np.isfinite(rows)), "is not finite")
     require(np.all(np.diff(time) > 0.0), "is not sorted by time")
+
+
+def _check_inertial(stream: InertialStream) -> None:
+    require(abs(stream.offset) < LARGEST_OFFSET, "has an invalid offset")
+    usual = stream.usual
+    require(usual is None or SHORTEST_INTERVAL <= usual < np.inf, "has an invalid interval")
 
 
 def _check_window(window: SlidingWindow) -> None:
