@@ -9,7 +9,6 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import OnlineStart
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -35,6 +34,7 @@ from magfusion.estimation.online_integrity.online import EpochSummary, OnlineMon
 from magfusion.estimation.online_integrity.open_roll import roll_findings
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.estimation.online_integrity.settlement import SettlementTest
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
