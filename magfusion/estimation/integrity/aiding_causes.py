@@ -151,9 +151,9 @@ def _cause_of(
     as_declared = _square(sensor, some, some.value, some.predicted)
     if as_declared < CLEARLY * expected:
         return None
-    near = as_declared
-    if sensor.quantity in WITH_OFFSET:  # an offset is a parameter, which the score tests
-        near, _ = _with_offset(sensor, some)
+    # An offset is a parameter, which the score tests; samples without a signal show no unit.
+    rivals = [_in_other_axes(sensor, some, factor, np.eye(3))[0] for factor in (0.0, 1.0)]
+    near = min(as_declared, *rivals)
     for tried in (_of_units, _of_points):
         square, cause = _simplest(list(tried(sensor, some, others)))
         if square < ENOUGH * expected and CLEARLY * square < near:
@@ -210,6 +210,7 @@ def _of_units(
         every = (np.asarray(axes, dtype=float) for axes in signed_permutations())
         of_axes += [axes for axes in every if np.linalg.det(axes) > 0.0 and np.trace(axes) < 3.0]
     units = [(name, sign * one) for name, one in UNITS[sensor.quantity].items() for sign in (1, -1)]
+    units.sort(key=lambda one: abs(one[1]) != 1.0)  # a sign is more often wrong
 
     def changes(one: tuple[tuple[str, float], Array]) -> int:
         factor = one[0][1] / sensor.unit

@@ -83,7 +83,7 @@ class EpochUpdate:
     ) -> None:
         self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
-        self.aiding = AidingGate(blocks, self.gate.counts)
+        self.aiding = AidingGate(site, blocks, self.gate.counts)
         self.of_currents: tuple[Finding, ...] = ()
         self._roll = roll_findings(site)
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
