@@ -109,7 +109,7 @@ def _recorded(name: str, factor: float | Array, offset: float = 0.0) -> Change:
 
 def _off(sensor: AidingSensor) -> AidingSensor:
     assert sensor.point_world is not None
-    return replace(sensor, point_world=sensor.point_world + [8.0, -4.0, 0.0])
+    return replace(sensor, point_world=sensor.point_world + np.array([8.0, -4.0, 0.0]))
 
 
 def _mirrored(sensor: AidingSensor) -> AidingSensor:
