@@ -152,7 +152,7 @@ class EpochUpdate:
         self._update_monitor(before, predicted, estimator.state, result)
         if result is not None and isinstance(result.phasors, FieldPhasors):
             self.settlement.update(result.phasors, result.samples, estimator.state)
-            self._compare(result.samples, estimator.state)
+            self._compare(result.phasors, result.samples, estimator.state)
         verdicts = self._judge_state(estimator.state, self._lost_since(estimator.state))
         return verdicts if result is None else replace(verdicts, detected=result.detected)
 
@@ -251,12 +251,14 @@ class EpochUpdate:
         findings = self.aiding.assessed(findings, state.time, self.score.named)
         return findings if self.bank is None else self.bank.with_levels(findings, state)
 
-    def _compare(self, samples: FieldSamples, state: State) -> None:
+    def _compare(self, measured: FieldPhasors, samples: FieldSamples, state: State) -> None:
         """Compare the state with a fix from time to time."""
         if self.metal.near:
             return
         requested = self.monitor.needs_second_fix
-        if (distance := self._comparison.compare(samples, state, requested=requested)) is not None:
+        if (
+            distance := self._comparison.compare(measured, samples, state, requested=requested)
+        ) is not None:
             self.monitor.compared(*distance)
 
     # Loss and recovery
