@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from magfusion.files.site_magnetometer import MountingEntry
 from magfusion.files.site_plain import degree_sigma_entry, plain, rotation_of, rpy_deg, sigma_entry
@@ -152,12 +152,17 @@ class PositionEntry(_Mounted):
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
 
 
+def _named_by_text(marks: Any) -> Any:
+    """Return marks whose names are texts: YAML reads 7 as a number, a table as a text."""
+    return {str(k): v for k, v in marks.items()} if isinstance(marks, dict) else marks
+
+
 class MarkEntry(_Mounted):
     """The sensor is on a mark."""
 
     quantity: Literal["mark"]
     noise_m: AboveZero
-    marks_m: Annotated[dict[str, Position], Field(min_length=1)]
+    marks_m: Annotated[dict[str, Position], Field(min_length=1), BeforeValidator(_named_by_text)]
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
 
 
