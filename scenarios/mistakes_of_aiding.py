@@ -86,6 +86,7 @@ def _outliers(name: str, size: float) -> Change:
         hit = case.rng.random(len(samples)) < SHARE
         wrong: Array = case.rng.uniform(-size, size, samples.value.shape)
         wrong[:, :1] *= samples.quantity != "relative_pose"  # its interval
+        wrong = np.abs(wrong) if samples.quantity == "range" else wrong  # a reflection is longer
         value = samples.value + hit[:, None] * wrong
         aiding = {**aided.log.aiding, name: replace(samples, value=value)}
         return replace(aided, log=replace(aided.log, aiding=aiding))
@@ -93,6 +94,36 @@ def _outliers(name: str, size: float) -> Change:
     return changed
 
 
+def _recorded(name: str, factor: float | Array, offset: float = 0.0) -> Change:
+    """Return data of a sensor in another unit, with another sign or in other axes."""
+
+    def changed(case: Case) -> Case:
+        aided = _aided(case, name)
+        samples = aided.log.aiding[name]
+        by = factor if isinstance(factor, np.ndarray) else factor * np.eye(samples.value.shape[1])
+        own = replace(samples, value=samples.value @ by.T + offset)
+        return replace(aided, log=replace(aided.log, aiding={**aided.log.aiding, name: own}))
+
+    return changed
+
+
+def _off(sensor: AidingSensor) -> AidingSensor:
+    assert sensor.point_world is not None
+    return replace(sensor, point_world=sensor.point_world + np.array([8.0, -4.0, 0.0]))
+
+
+def _mirrored(sensor: AidingSensor) -> AidingSensor:
+    assert sensor.point_world is not None
+    return replace(sensor, point_world=sensor.point_world * [-1.0, 1.0, 1.0])
+
+
+def _too_exact(sensor: AidingSensor) -> AidingSensor:
+    return replace(sensor, sigma=0.1 * sensor.sigma)
+
+
+FLU = np.diag([1.0, -1.0, -1.0])  # axes forward, left, up in place of forward, right, down
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_UNITS, _POINT = ("aiding_units",), ("aiding_point",)
 _LEVER, _CLOCK = ("aiding_lever_arm",), ("aiding_clock",)
 _LEVER_OR_OFFSET = ("aiding_lever_arm", "aiding_offset")  # of one attitude they are one
 
@@ -126,5 +157,17 @@ MISTAKES = (
         )
     ),
     Mistake("relative_outliers", "aiding", _outliers("keyframes", 0.3), harmless=True),
+    Mistake("velocity_kmh", "aiding", _recorded("visual", 3.6), _UNITS, REST),
+    Mistake("velocity_flu", "aiding", _recorded("visual", FLU), ("aiding_mounting",), REST),
+    Mistake("range_mm", "aiding", _recorded("anchor", 1e3), _UNITS),
+    Mistake("position_ned", "aiding", _recorded("prism", NED), ("aiding_mounting",)),
+    Mistake("height_depth", "aiding", _recorded("level", -1.0), (*_UNITS, "aiding_offset")),
+    Mistake(
+        "heading_ccw", "aiding", _recorded("compass", -1.0, 90 * DEGREE), (*_UNITS, "aiding_offset")
+    ),
+    Mistake("heading_rad", "aiding", _recorded("compass", DEGREE), (*_UNITS, "aiding_offset")),
+    Mistake("range_point_9m", "aiding", _declared("anchor", _off), _POINT),
+    Mistake("range_point_mirrored", "aiding", _declared("anchor", _mirrored), _POINT),
+    Mistake("range_noise_tenth", "aiding", _declared("anchor", _too_exact), ("aiding_noise",)),
     Mistake("heading_outliers", "aiding", _outliers("compass", 90.0 * DEGREE), harmless=True),
 )

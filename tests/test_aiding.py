@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +25,11 @@ from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
+from magfusion.files.aiding_tables import read_aiding
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
+from magfusion.files.site_aiding import MarkEntry, aiding_sensor
+from magfusion.files.table import Span
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.aiding import QUANTITIES, AidingSamples, AidingSensor, AidingSigma
 from magfusion.model.parameters import (
@@ -459,3 +463,25 @@ def test_driving_is_along_the_body_and_level():
     velocity_body = attitude.inv().apply(motion.velocity_world(time))
     assert np.max(np.abs(velocity_body[:, 1:])) < 0.005  # m/s
     assert np.max(np.abs(attitude.as_matrix()[:, 2, 2] - 1.0)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("header", "stamp", "part"),
+    [
+        ("time_ns,range_m", "1700000001000000000", "rename range_m to range, or add"),
+        ("time_ns,range", "1700000001.5", "write whole numbers, of time_ns nanoseconds"),
+    ],
+)
+def test_a_table_that_is_nearly_right_is_refused_with_the_remedy(
+    tmp_path: Path, header: str, stamp: str, part: str
+) -> None:
+    (tmp_path / "range.csv").write_text(f"{header}\n{stamp},3.1\n")
+    with pytest.raises(InputError, match=part):
+        read_aiding({"range": tmp_path / "range.csv"}, Span(1_700_000_000_000_000_000))
+
+
+def test_marks_may_have_numbers_for_names() -> None:
+    entry = MarkEntry.model_validate(
+        {"quantity": "mark", "noise_m": 0.1, "marks_m": {7: [1, 2, 3]}}
+    )
+    assert list(aiding_sensor(entry).marks_world) == ["7"]

@@ -13,13 +13,14 @@ from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.integrity.smoothed_separation import separate_sensors
 from magfusion.estimation.measurements.aiding_samples import aiding_measurement
+from magfusion.estimation.online.corrected import corrected
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.score_epochs import Sums, new_sums
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.jobs.replay import Replay, feed
-from magfusion.model.aiding import AidingSamples
+from magfusion.model.aiding import AidingSamples, AidingSensor, sensor_named
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -138,9 +139,32 @@ def test_rejected_samples_are_scored_without_a_gain() -> None:
 
 
 def test_a_named_parameter_hides_no_other_sensor_that_contradicts() -> None:
-    gate = AidingGate((), Counter())
+    gate = AidingGate(aided_site(WHEELS), (), Counter())
     gate.rejected_share = {"wheels": 0.5, "anchor": 0.4}
     every = gate.assessed(Judgement(), 10.0, ())
     assert [f.code for f in every.findings] == ["aiding_disagrees"] * 2
     others = gate.assessed(Judgement(), 10.0, ("wheels",)).findings
     assert [f.text.split()[0] for f in others] == ["anchor"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "unit"), [("level", -1.0), ("visual", 1.0 / 3.6)])
+def test_a_unit_is_named_and_undone_online(name: str, unit: float) -> None:
+    site = aided_site(
+        AidingSensor("visual", "velocity", 0.02), AidingSensor("level", "height", 0.02)
+    )
+    config = SimulationConfig(ROOM * [1.0, 1.0, 1.5], 25.0, motion="walk")
+    simulated = simulate_log(site, config, np.random.default_rng(1))
+    own = simulated.log.aiding[name]
+    wrong = {**simulated.log.aiding, name: replace(own, value=own.value / unit)}
+    navigator = Navigator(site, NavigatorSettings(estimator="ekf"))
+    for _, piece in Replay(replace(simulated.log, aiding=wrong)).pieces():
+        feed(navigator, piece)
+        navigator = corrected(navigator)
+    (finding,) = navigator.corrected
+    assert finding.code == "aiding_units"
+    assert finding.text.startswith(f"{name} contradicts the estimate as declared")
+    assert sensor_named(navigator.site.aiding, name).unit == pytest.approx(unit, rel=1e-5)
+    state = navigator.state
+    assert state is not None
+    assert [f.code for f in navigator.judgement.reasons] == ["aiding_units"]

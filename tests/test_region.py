@@ -10,9 +10,9 @@ from conftest import run_command
 from tracker_site import body_poses, in_beacon, tracker_site
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.region_option import Where

@@ -148,7 +148,7 @@ def test_an_interval_without_all_its_samples_is_not_measured() -> None:
     long = replace(long, interval=np.array([2.1])).over_interval(
         whole, 0.0, np.array([12.0]), BIAS[None], SITE
     )
-    gate = AidingGate(BLOCKS, Counter())
+    gate = AidingGate(SITE, BLOCKS, Counter())
     for one in (*lacking, long):
         assert np.all(np.isinf(one.sigma))
         assert gate.passed([one], _state(motion, 12.0)) == []

@@ -80,3 +80,11 @@ def test_check_refuses_a_sensor_that_the_site_lacks(tmp_path: Path) -> None:
     save_site(aided_site(replace(LEVEL, name="level_1")), tmp_path / "log" / "site.yaml")
     with pytest.raises(InputError, match="level is no aiding sensor of the site"):
         run_check(CheckSettings(log=tmp_path / "log"))
+
+
+def test_stamps_in_another_unit_are_named() -> None:
+    epoch = 1_700_000_000.0  # s
+    milliseconds = (epoch + EVERY) * 1e-6 - epoch  # read as nanoseconds
+    log = replace(_log(milliseconds), epoch_ns=int(epoch * 1e9))
+    (finding,) = silent_aiding(log, aided_site(LEVEL))
+    assert "They are milliseconds: write nanoseconds." in finding.text

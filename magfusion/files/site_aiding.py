@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from magfusion.files.site_magnetometer import MountingEntry
 from magfusion.files.site_plain import degree_sigma_entry, plain, rotation_of, rpy_deg, sigma_entry
@@ -11,6 +11,7 @@ from magfusion.files.site_values import (
     LARGEST_ANGLE,
     LARGEST_DISTANCE,
     AboveZero,
+    Angles,
     FromZero,
     NotNegative,
     Position,
@@ -40,6 +41,12 @@ LARGEST_HEIGHT = 1e5  # m; the space begins there
 HIGHEST_PRESSURE = 1e9  # Pa; ten times that of the deepest sea
 _Distance = Annotated[float, between(-LARGEST_DISTANCE, LARGEST_DISTANCE)]
 _Share = Annotated[FromZero, between(0.0, 1.0)]
+
+
+def _not_zero(value: float) -> float:
+    if value == 0.0:
+        raise ValueError("is zero; give the SI value of one recorded unit")
+    return value
 
 
 class _Sigma(StrictModel):
@@ -73,6 +80,7 @@ class _Sensor(StrictModel):
     name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)] | None = None
     time_offset_s: Annotated[float, between(-1e3, 1e3)] = 0.0
     rate_hz: Annotated[AboveZero, between(1e-3, 1e3)] = AIDING_RATE
+    unit: Annotated[float, between(-1e6, 1e6), AfterValidator(_not_zero)] = 1.0
 
 
 class _Mounted(_Sensor):
@@ -108,11 +116,16 @@ class _WithOffset(_Mounted):
     sigma: _OffsetSigma = Field(default_factory=_OffsetSigma)
 
 
+class _RangeSigma(_OffsetSigma):
+    point_m: PositionSigma = Field(default_factory=zeros)
+
+
 class RangeEntry(_WithOffset):
     """Distance from a known point."""
 
     quantity: Literal["range"]
     point_m: Position
+    sigma: _RangeSigma = Field(default_factory=_RangeSigma)
 
 
 class OriginEntry(StrictModel):
@@ -123,13 +136,25 @@ class OriginEntry(StrictModel):
     height_m: Annotated[float, between(-LARGEST_HEIGHT, LARGEST_HEIGHT)]
 
 
+class FrameEntry(StrictModel):
+    """Axes in which positions are given."""
+
+    rpy_deg: Angles = Field(default_factory=zeros)
+
+
 class PositionEntry(_Mounted):
     """Position of the sensor."""
 
     quantity: Literal["position"]
     noise_m: AboveZero
     origin: OriginEntry | None = None
+    world_from_sensor: FrameEntry = Field(default_factory=lambda: FrameEntry())
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
+
+
+def _named_by_text(marks: Any) -> Any:
+    """Return marks whose names are texts: YAML reads 7 as a number, a table as a text."""
+    return {str(k): v for k, v in marks.items()} if isinstance(marks, dict) else marks
 
 
 class MarkEntry(_Mounted):
@@ -137,7 +162,7 @@ class MarkEntry(_Mounted):
 
     quantity: Literal["mark"]
     noise_m: AboveZero
-    marks_m: Annotated[dict[str, Position], Field(min_length=1)]
+    marks_m: Annotated[dict[str, Position], Field(min_length=1), BeforeValidator(_named_by_text)]
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
 
 
@@ -215,9 +240,12 @@ def aiding_sensor(entry: AidingEntry) -> AidingSensor:
             np.array(getattr(entry.sigma, "scale", 0.0)),
             np.array(number(entry.sigma, "offset")),
             np.array(entry.sigma.time_offset_s),
+            getattr(entry.sigma, "point_m", zeros()),
         ),
         None if origin is None else (origin.latitude_deg, origin.longitude_deg, origin.height_m),
         entry.noise_deg * DEGREE if isinstance(entry, RelativePoseEntry) else 0.0,
+        entry.unit,
+        rotation_of(getattr(entry, "world_from_sensor", FrameEntry()).rpy_deg),
     )
 
 
@@ -242,6 +270,7 @@ def _entry(sensor: AidingSensor) -> dict[str, Any]:
         f"offset_walk_{unit}": (_number(sensor.offset_walk, size), 0.0),
         "time_offset_s": (float(sensor.time_offset), 0.0),
         "rate_hz": (sensor.rate_hz, AIDING_RATE),
+        "unit": (sensor.unit, 1.0),
         "marks_m": (plain(sensor.marks_world), {}),
         "sigma": (sigma, {}),
     }
@@ -255,6 +284,8 @@ def _entry(sensor: AidingSensor) -> dict[str, Any]:
         own["noise_deg"] = _number(sensor.rotation_sigma, DEGREE)
     if sensor.quantity in _MOVING and sensor.scale != 1.0:
         own["scale"] = float(sensor.scale)
+    if any(axes := rpy_deg(sensor.world_from_sensor)):
+        own["world_from_sensor"] = {"rpy_deg": axes}
     turn = rpy_deg(sensor.body_from_sensor)
     if sensor.position_body.any() or any(turn):
         position = plain(sensor.position_body)
@@ -273,6 +304,8 @@ def _sigma_entry(sensor: AidingSensor, unit: str, size: float) -> dict[str, Any]
         entry["scale"] = float(sigmas.scale)
     if sensor.quantity not in (*_MOVING, "position", "mark") and sigmas.offset:
         entry[f"offset_{unit}"] = _number(sigmas.offset, size)
+    if sensor.quantity == "range" and sigmas.point_world.any():
+        entry["point_m"] = sigma_entry(sigmas.point_world)
     if sigmas.time_offset:
         entry["time_offset_s"] = float(sigmas.time_offset)
     return entry

@@ -100,9 +100,11 @@ class TableLayout(NamedTuple):
         wanted = self._wanted(result)
         missing = [name for name in wanted if name not in result]
         if missing:
+            pairs = ((other, name) for name in missing for other in result if _is_like(other, name))
+            renamed = next((f"rename {other} to {name}, or " for other, name in pairs), "")
             raise InputError(
                 f"{path}: {_listed(missing)} missing (found {', '.join(result)});"
-                " add what is missing."
+                f" {renamed}add what is missing."
             )
         repeated = [name for name in wanted if list(result).count(name) > 1]
         if repeated:
@@ -223,7 +225,9 @@ def read_table(
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
+        integers = "write whole numbers, of time_ns nanoseconds"
+        remedy = integers if "int64" in reason else "write the file again"
+        raise InputError(f"{path}: cannot be read ({reason}); {remedy}.") from error
     whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
     time_ns = whole.integers(TIME)
     if layout.strays and (stray := all_strays(time_ns)).any():
@@ -334,7 +338,8 @@ def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span
     seconds = span.seconds(time_ns)
     merged = (np.diff(seconds, prepend=-np.inf) == 0.0) & (step > 0)
     remedy = (
-        "too far from epoch_ns to distinguish it from the row above: set epoch_ns near the times"
+        "too far from epoch_ns to distinguish it from the row above: set epoch_ns near the times,"
+        " or write nanoseconds"
     )
     whole.refuse(merged, TIME, time_ns, remedy)
 
@@ -352,6 +357,11 @@ def _integer_type(result: pa.DataType, name: str, path: Path) -> None:
 def _refuse_empty(rows: int, path: Path) -> None:
     if rows == 0:
         raise InputError(f"{path}: holds no rows; record at least one, or remove the file.")
+
+
+def _is_like(column: str, wanted: str) -> bool:
+    """Return whether a column is a wanted one with or without a unit: ``range_m``, ``heading``."""
+    return column.startswith(f"{wanted}_") or wanted.startswith(f"{column}_")
 
 
 def _listed(names: Sequence[str]) -> str:

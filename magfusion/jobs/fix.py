@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.ambiguity import relations
 from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes, explained_fixes
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
 from magfusion.estimation.snapshot.problem import ESTIMABLE
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.files.fix_table import write_hypotheses
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum

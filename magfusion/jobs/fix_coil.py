@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.ambiguity import relations
 from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, CoilFixes, Gain, fix_coil
 from magfusion.estimation.snapshot.coil_poses import (
@@ -20,6 +19,7 @@ from magfusion.estimation.snapshot.coil_poses import (
 )
 from magfusion.estimation.snapshot.coil_starts import CoilEpochs
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report
 from magfusion.model.samples import FieldSamples, Log

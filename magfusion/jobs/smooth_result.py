@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
+from magfusion.estimation.integrity.aiding_causes import aiding_diagnosis, compared_smoothed
 from magfusion.estimation.integrity.change_detection import changed_beacon, explained_throughout
 from magfusion.estimation.integrity.correction import (
     Correction,
@@ -152,7 +153,8 @@ def finished(
     mapped = steel is not None and steel.is_used
     cause = None
     if correction is None and not mapped:
-        cause = diagnosed(log, site, trust, settings.lockin)
+        cause = aiding_diagnosis(site, compared_smoothed(separated.result))
+        cause = cause or diagnosed(log, site, trust, settings.lockin)
     possible = corrections(site, trust.reasons, () if changes else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     if is_named and cause is not None and not cause.is_clear:

@@ -34,6 +34,7 @@ class AidingSigma:
     scale: Array = field(default_factory=_zero)
     offset: Array = field(default_factory=_zero)
     time_offset: Array = field(default_factory=_zero)
+    point_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,16 @@ class AidingSensor:
     # of GNSS; the world's axes are east, north and up there
     origin: tuple[float, float, float] | None = None
     rotation_sigma: float = 0.0  # of the rotation of a relative pose (rad)
+    # SI value of a recorded one: of a velocity in km/h 1 / 3.6, of a depth as a height -1; of a
+    # mark that of ``marks_world``
+    unit: float = 1.0
+    # (3, 3), axes of the positions, as of a total station's frame
+    world_from_sensor: Array = field(default_factory=lambda: np.eye(3))
+
+    def in_si(self, recorded: Array) -> Array:
+        """Return recorded vectors or numbers (n, k) in SI units and world axes."""
+        own = self.quantity == "position"
+        return self.unit * (recorded @ self.world_from_sensor.T if own else recorded)
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,7 +93,9 @@ def _record(
     share = sensor.relative_sigma if sensor.quantity == "velocity" else 0.0
     noise = np.hypot(sensor.sigma, share * speed) * rng.standard_normal(ideal.shape)
     value = sensor.scale * ideal + offset[:, None] + noise
-    return AidingSamples(sensor.quantity, time, value)
+    own = sensor.quantity == "position"
+    recorded = value @ sensor.world_from_sensor if own else value
+    return AidingSamples(sensor.quantity, time, recorded / sensor.unit)
 
 
 def _noisy_poses(
@@ -106,4 +108,5 @@ def _noisy_poses(
     error = Rotation.from_rotvec(sensor.rotation_sigma * noise[:, 3:])
     turn = (Rotation.from_rotvec(ideal[:, 3:]) * error).as_rotvec()
     interval = np.full((len(time), 1), _interval(sensor))
-    return AidingSamples(sensor.quantity, time, np.hstack([interval, translation, turn]))
+    recorded = np.hstack([interval, translation / sensor.unit, turn])
+    return AidingSamples(sensor.quantity, time, recorded)

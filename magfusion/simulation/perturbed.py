@@ -44,6 +44,9 @@ def _perturb_aiding(sensor: AidingSensor, draw: Draw) -> AidingSensor:
     scale = draw("aiding", name, "scale", sigmas.scale[None])[0]
     offset = draw("aiding", name, "offset", sigmas.offset[None])[0]
     late = draw("aiding", name, "clock_offset", sigmas.time_offset[None])[0]
+    if sensor.point_world is not None:
+        moved = draw("aiding", name, "point", sigmas.point_world)
+        sensor = replace(sensor, point_world=sensor.point_world + moved)
     return replace(
         sensor,
         position_body=sensor.position_body + lever,

@@ -223,20 +223,24 @@ def silent_aiding(log: Log, site: Site | None) -> Iterator[Finding]:
                 " the sensor in it."
             )
         else:
-            yield from _gaps(sensor, samples, begin, end)
+            yield from _gaps(sensor, samples, begin, end, 1e-9 * log.epoch_ns)
 
 
 def _gaps(
-    sensor: AidingSensor, samples: AidingSamples, begin: float, end: float
+    sensor: AidingSensor, samples: AidingSamples, begin: float, end: float, epoch: float
 ) -> Iterator[Finding]:
-    """Yield a remark on the parts without samples of a sensor that has some."""
+    """Yield a remark on the parts without samples of a sensor that has some; `epoch` (s)."""
     time = samples.time + float(sensor.time_offset)
     inside = time[(time >= begin) & (time <= end)]
     if not len(inside):
+        stamps = epoch + float(time[0])  # in seconds, if they are nanoseconds
+        units = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3}
+        likely = (u for u, size in units.items() if begin <= size * stamps - epoch <= end)
+        unit = next((f" They are {one}: write nanoseconds." for one in likely), "")
         yield _remark(
             f"The samples of {sensor.name}, from {time[0]:.1f} to {time[-1]:.1f} s, are outside the"
             f" log ({begin:.1f} to {end:.1f} s) and not used. Check the clock of its stamps, or"
-            " correct time_offset_s."
+            f" correct time_offset_s.{unit}"
         )
     elif sensor.quantity != "mark" and len(inside) >= MIN_SAMPLES:
         edges = np.concatenate([[begin], inside, [end]])

@@ -14,6 +14,7 @@ from magfusion.model.ground import conductivity_of
 from magfusion.model.parameters import (
     AIDING_CLOCK,
     AIDING_OFFSET,
+    AIDING_POINT,
     AIDING_POSITION,
     AIDING_PRESSURE,
     AIDING_ROTATION,
@@ -90,6 +91,7 @@ TYPICAL: dict[Parameter, float] = {
     AIDING_CLOCK: 0.01,
     AIDING_ROTATION: DEGREE,
     AIDING_POSITION: 0.05,
+    AIDING_POINT: 0.05,
 }
 
 # What no site declares and every instrument has: scales and axes of a MEMS, where in its case the
@@ -113,7 +115,13 @@ USUAL: dict[Parameter, float] = TOLERANCE | {
 }
 
 # What is larger is another mistake: a unit, an axis, gravity.
-LARGEST: dict[Parameter, float] = {GYRO_BIAS: 0.5, ACCEL_BIAS: 1.5, GYRO_ALIGNMENT: 20.0 * DEGREE}
+LARGEST: dict[Parameter, float] = {
+    GYRO_BIAS: 0.5,
+    ACCEL_BIAS: 1.5,
+    GYRO_ALIGNMENT: 20.0 * DEGREE,
+    AIDING_POSITION: 3.0,  # of a vehicle
+}
+
 
 # Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
 CODE: dict[Parameter, str] = {
@@ -147,6 +155,7 @@ CODE: dict[Parameter, str] = {
     AIDING_CLOCK: "aiding_clock",
     AIDING_ROTATION: "aiding_mounting",
     AIDING_POSITION: "aiding_lever_arm",
+    AIDING_POINT: "aiding_point",
 }
 
 LEVER_ARM = "the lever arm of the magnetometer"
@@ -156,7 +165,7 @@ TYPICAL_SHIFT = 1e-3  # s, of stamps against the drives: a driver's or a bus's d
 # How often it is wrong, relative to what one beacon or one sensor is declared as: a whole survey is
 # seldom tilted, and gyros seldom are that bad.
 RARE = 0.1
-RARELY_WRONG: tuple[Parameter, ...] = (GYRO_ALIGNMENT, GYRO_G_SENSITIVITY, GRAVITY)
+RARELY_WRONG: tuple[Parameter, ...] = (GYRO_ALIGNMENT, GYRO_G_SENSITIVITY, GRAVITY, AIDING_POINT)
 TYPICAL_TILT = 0.5 * DEGREE  # of a survey by a level; a beacon alone is turned by more
 
 

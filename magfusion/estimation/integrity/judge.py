@@ -23,7 +23,6 @@ from magfusion.estimation.integrity.convergence_report import (
 )
 from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.residual_blocks import (
     compass,
@@ -37,6 +36,7 @@ from magfusion.estimation.integrity.smoothed_separation import contradicting_sen
 from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.arguments import check_arguments
 from magfusion.model.samples import Log

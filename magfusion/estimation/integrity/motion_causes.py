@@ -90,7 +90,7 @@ def _rotated_axes(known: Compared, before: float, site: Site) -> Iterator[Explan
     Both rotate together; but the lever arm, declared in the IMU's axes, turns with the IMU alone.
     """
     lever = site.platform.magnetometer.position_body
-    for axes in _signed_permutations():
+    for axes in signed_permutations():
         if np.linalg.det(axes) < 0 or np.allclose(axes, EYE):
             continue
         by = f"by {Rotation.from_matrix(axes).magnitude() / DEGREE:.0f} degrees"
@@ -126,7 +126,7 @@ def with_quarter_turn(known: Compared, site: Site) -> Site | None:
     """
     sensor = site.platform.magnetometer
     lever, mounting = sensor.position_body, sensor.body_from_sensor
-    turns = [axes for axes in _signed_permutations() if np.linalg.det(axes) > 0.0]
+    turns = [axes for axes in signed_permutations() if np.linalg.det(axes) > 0.0]
     costs = [known.explained(axes, axes, lever=lever - axes @ lever)[0] for axes in turns]
     first, second = np.argsort(costs)[:2]
     if costs[second] < CLEARLY * costs[first]:
@@ -251,7 +251,7 @@ def _accel_scaled(known: Compared, before: float, site: Site) -> Iterator[Explan
 
 
 def _axes(tried: Callable[[str, str, str, Array, Array], Explanation]) -> Iterator[Explanation]:
-    for axes in _signed_permutations():
+    for axes in signed_permutations():
         words = _named(axes)
         if np.allclose(axes, EYE):
             continue
@@ -267,7 +267,8 @@ def _axes(tried: Callable[[str, str, str, Array, Array], Explanation]) -> Iterat
         yield tried(accel, cause, OF_AXES, EYE, axes)
 
 
-def _signed_permutations() -> Iterator[Array]:
+def signed_permutations() -> Iterator[Array]:
+    """Yield all 48 orders and signs of three axes, as matrices."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             yield np.diag(signs) @ EYE[list(order)]

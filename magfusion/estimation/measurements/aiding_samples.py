@@ -46,7 +46,8 @@ def aiding_measurement(
     """
     if sensor.quantity == "relative_pose":
         return relative_pose(sensor, samples, robust)
-    value = _on_marks(sensor, samples) if sensor.quantity == "mark" else samples.value
+    own = _on_marks(sensor, samples) if sensor.quantity == "mark" else samples.value
+    value = sensor.in_si(own)
     missing = np.isnan(value)
     speed = np.sqrt(np.nansum(value**2, axis=1))
     noise = np.hypot(sensor.sigma, sensor.relative_sigma * speed)

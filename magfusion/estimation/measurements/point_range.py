@@ -8,7 +8,7 @@ from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.aiding import AidingMeasurement, Prediction
 from magfusion.estimation.measurements.point_position import point_world
 from magfusion.model.aiding import AidingSensor
-from magfusion.model.parameters import AIDING_OFFSET, AIDING_POSITION
+from magfusion.model.parameters import AIDING_OFFSET, AIDING_POINT, AIDING_POSITION
 from magfusion.units import Array
 
 NEAREST = 1e-6  # m; a range has no direction at its origin
@@ -31,5 +31,6 @@ class PointRange(AidingMeasurement):
             by_parameter={
                 AIDING_OFFSET: np.ones((len(states), 1, 1)),
                 AIDING_POSITION: along @ states.world_from_body,
+                AIDING_POINT: -along,
             },
         )

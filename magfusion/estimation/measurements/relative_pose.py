@@ -195,7 +195,7 @@ def relative_pose(
 ) -> RelativePose:
     """Return samples of a sensor as a measurement, without the inertial samples it needs."""
     count = len(samples)
-    translation = samples.value[:, 1:4]
+    translation = sensor.in_si(samples.value[:, 1:4])
     noise = np.repeat([[sensor.sigma, sensor.rotation_sigma]], 3, axis=1).repeat(count, axis=0)
     way = np.linalg.norm(translation, axis=1, keepdims=True)
     noise[:, :3] = np.hypot(noise[:, :3], sensor.relative_sigma * way)

@@ -9,7 +9,6 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import OnlineStart
-from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -35,6 +34,7 @@ from magfusion.estimation.online_integrity.online import EpochSummary, OnlineMon
 from magfusion.estimation.online_integrity.open_roll import roll_findings
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.estimation.online_integrity.settlement import SettlementTest
+from magfusion.estimation.snapshot.region_test import of_place
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -83,7 +83,7 @@ class EpochUpdate:
     ) -> None:
         self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
-        self.aiding = AidingGate(blocks, self.gate.counts)
+        self.aiding = AidingGate(site, blocks, self.gate.counts)
         self.of_currents: tuple[Finding, ...] = ()
         self._roll = roll_findings(site)
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
@@ -152,7 +152,7 @@ class EpochUpdate:
         self._update_monitor(before, predicted, estimator.state, result)
         if result is not None and isinstance(result.phasors, FieldPhasors):
             self.settlement.update(result.phasors, result.samples, estimator.state)
-            self._compare(result.samples, estimator.state)
+            self._compare(result.phasors, result.samples, estimator.state)
         verdicts = self._judge_state(estimator.state, self._lost_since(estimator.state))
         return verdicts if result is None else replace(verdicts, detected=result.detected)
 
@@ -251,12 +251,14 @@ class EpochUpdate:
         findings = self.aiding.assessed(findings, state.time, self.score.named)
         return findings if self.bank is None else self.bank.with_levels(findings, state)
 
-    def _compare(self, samples: FieldSamples, state: State) -> None:
+    def _compare(self, measured: FieldPhasors, samples: FieldSamples, state: State) -> None:
         """Compare the state with a fix from time to time."""
         if self.metal.near:
             return
         requested = self.monitor.needs_second_fix
-        if (distance := self._comparison.compare(samples, state, requested=requested)) is not None:
+        if (
+            distance := self._comparison.compare(measured, samples, state, requested=requested)
+        ) is not None:
             self.monitor.compared(*distance)
 
     # Loss and recovery

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.state import State
-from magfusion.estimation.integrity.correction import Correction, continued, spread_of
+from magfusion.estimation.integrity.correction import Correction, continued, corrections, spread_of
 from magfusion.estimation.online.applied_corrections import AppliedCorrections
 from magfusion.estimation.online.epoch_update import Estimator
 from magfusion.estimation.online.fixed_lag import SlidingWindow
@@ -132,8 +132,11 @@ class EstimationLoop:
         """Propagate to an epoch, process its measurements, and report its state."""
         predicted, judgement = self.running.process(epoch.time, epoch.samples, self.arrived)
         score = self.running.update.score
-        if score.correction is not None or score.is_steel:
-            self.possible = () if score.correction is None else (score.correction,)
+        aiding, known = self.running.update.aiding, score.correction
+        known = None if known is None or aiding.is_early(known) else known
+        of_aiding = corrections(self.site, (), (), aiding.diagnosis)
+        if known is not None or score.is_steel or of_aiding:
+            self.possible = (*of_aiding, *(() if known is None else (known,)))
         self.corrections.drop_refuted(score)
         state: State = estimator.state
         reports, counts = self.reports, self.counts

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.graph.state import State
-from magfusion.estimation.online_integrity.recovery import AgreedFix, agreed_fix, explains
+from magfusion.estimation.graph.state import State, states_of
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.online_integrity.recovery import AgreedFix, agreed_fix, at_fix, explains
 from magfusion.estimation.snapshot.fix import AS_LIKELY
 from magfusion.model.samples import FieldSamples
 
@@ -21,11 +22,13 @@ class FixComparison:
         self._compared_at, self._since_compared = -np.inf, COMPARED_EPOCHS
 
     def compare(
-        self, samples: FieldSamples, state: State, *, requested: bool
+        self, measured: FieldPhasors, samples: FieldSamples, state: State, *, requested: bool
     ) -> tuple[float, float] | None:
         """Return squared distance and offset (m) of a state from a fix, if it is due and usable.
 
-        `requested`: whether a fix is due, whenever the last was.
+        A state that explains the epoch about as well is no farther than zero: of a far beacon alone
+        the poses that do lie on a curve, which no covariance describes. `requested`: whether a fix
+        is due, whenever the last was.
         """
         self._since_compared += 1
         due = state.time >= self._compared_at + COMPARED_EVERY
@@ -37,7 +40,16 @@ class FixComparison:
         lacking = calibration.site.platform.magnetometer.lacking
         if fix is None or (lacking and not fix.fixes.determined[0, 0]):
             return None  # an undetermined roll is equally far from any state
-        return _distance_to_fix(state, fix) if explains(fix, samples, calibration) else None
+        if not explains(fix, samples, calibration):
+            return None
+        squares = [_square(measured, one) for one in (state, at_fix(state, fix))]
+        return (0.0, 0.0) if squares[0] < squares[1] + AS_LIKELY else _distance_to_fix(state, fix)
+
+
+def _square(measured: FieldPhasors, state: State) -> float:
+    """Return the chi square of an epoch at a state."""
+    rows = measured.linearize(states_of([state]), state.calibration, ())
+    return float(np.sum(rows.error**2))
 
 
 def _distance_to_fix(state: State, fix: AgreedFix) -> tuple[float, float]:

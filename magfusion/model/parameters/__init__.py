@@ -12,6 +12,7 @@ import numpy as np
 from magfusion.model.channel_effects import axis_factors, responded
 from magfusion.model.parameters.aiding import AIDING_CLOCK as AIDING_CLOCK
 from magfusion.model.parameters.aiding import AIDING_OFFSET as AIDING_OFFSET
+from magfusion.model.parameters.aiding import AIDING_POINT as AIDING_POINT
 from magfusion.model.parameters.aiding import AIDING_POSITION as AIDING_POSITION
 from magfusion.model.parameters.aiding import AIDING_PRESSURE as AIDING_PRESSURE
 from magfusion.model.parameters.aiding import AIDING_ROTATION as AIDING_ROTATION
@@ -80,6 +81,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     AIDING_CLOCK,
     AIDING_ROTATION,
     AIDING_POSITION,
+    AIDING_POINT,
     CONDUCTIVITY,
     DECLINATION,
     STRENGTH,

@@ -102,6 +102,14 @@ class _Position(AidingParameter):
     of_quantities = tuple(kind for kind in QUANTITIES if kind != "heading")
 
 
+class _Point(AidingParameter):
+    kind, components = "point", AXES
+    attribute = sigma_attribute = "point_world"
+    unit, display_unit = METRE, CENTIMETRE
+    words = "{axis} of the point of {owner}"
+    of_quantities = ("range",)
+
+
 AIDING_SCALE, AIDING_OFFSET, AIDING_PRESSURE = _Scale(), _Offset(), _PressureOffset()
 AIDING_CLOCK = _Clock()
-AIDING_ROTATION, AIDING_POSITION = _Rotation(), _Position()
+AIDING_ROTATION, AIDING_POSITION, AIDING_POINT = _Rotation(), _Position(), _Point()
