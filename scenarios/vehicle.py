@@ -35,9 +35,6 @@ PLACES = (10.0, 40.0, 70.0, 100.0)  # m from each end
 GAP = (125.0, 275.0)  # m from the first end
 SLIP, SLIP_DURATION = 0.1, 2.0  # share, s
 TONES_HZ = 15.0 + 2.5 * np.arange(8)
-# m/s; the simulated vehicle does not slide. Declared ten times as large, the height is ten times
-# as uncertain as it is wrong, and the mean NEES a fifth too small.
-SIDEWAYS = 0.002
 CONFIDENT = 3.0  # m; who claims less after the gap must be right
 SILENT = 25.0  # NEES of six numbers; what is beyond is believed and wrong
 Aiding = Literal["wheels", "ranges", "heights", "marks", "none"]
@@ -95,7 +92,7 @@ def sensors_of(aiding: Aiding) -> tuple[AidingSensor, ...]:
         "velocity",
         sigma=0.005,
         relative_sigma=0.01,
-        constraint_sigma=SIDEWAYS,
+        constraint_sigma=0.02,
         sigmas=AidingSigma(scale=np.array(0.02)),
     )
     if aiding == "none":
