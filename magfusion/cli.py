@@ -38,7 +38,7 @@ TERMINATED = (
     "terminated, and unfinished files are removed; repeat the command, with --resume where it had a"
     " checkpoint"
 )
-LONGEST_REASON = 200  # characters, of an error that was not foreseen
+MAX_REASON = 200  # characters, of an error that was not foreseen
 _HELP = {"help_option_names": ["-h", "--help"]}
 
 
@@ -109,7 +109,7 @@ def _error_report(error: Exception) -> tuple[int, str]:
         return 2, _file_refusal(error)
     if isinstance(error, MemoryError):
         return 2, "not enough memory; use a shorter part, with --start and --end"
-    reason = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_REASON]
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_REASON]
     where = traceback.extract_tb(error.__traceback__)[-1]
     return 1, (
         f"internal error ({reason}; {Path(where.filename).name}, line"

@@ -37,8 +37,8 @@ from magfusion.units import DEGREE, Array, ComplexArray
 
 IMU_RATE_HZ = 100.0
 STEP = 0.2  # s between epochs
-EARLIEST, MAX_DELAY_S = 10.0, 20.0  # s, of a fault's begin
-LONGEST_RAMP = 10.0  # s
+MIN_ONSET, MAX_DELAY_S = 10.0, 20.0  # s, of a fault's begin
+MAX_RAMP = 10.0  # s
 IN_TIME = 2.0  # s, of an alarm after the level is left
 CONVERGED_STEP = 1.0  # s after the first state, before which there is no level yet
 MODES = 20  # of the field's error in space
@@ -138,8 +138,8 @@ def simulated(
     wrong = error_in_space(truth.position_world, 6 * channels, of_room.model_error, rng)
     parts = wrong.reshape(len(truth.time), channels, 3, 2)
     phasor = phasor + size * (parts[..., 0] + 1j * parts[..., 1])
-    began = rng.uniform(EARLIEST, MAX_DELAY_S)
-    ramp = 0.0 if rng.random() < 0.5 else rng.uniform(0.0, LONGEST_RAMP)
+    began = rng.uniform(MIN_ONSET, MAX_DELAY_S)
+    ramp = 0.0 if rng.random() < 0.5 else rng.uniform(0.0, MAX_RAMP)
     share = rng.uniform(-config.largest, config.largest)
     name = site.beacons[int(rng.integers(0, len(site.beacons)))].name
     phasor = _falsified(samples, phasor, name, share, began, ramp)

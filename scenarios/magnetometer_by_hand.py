@@ -32,7 +32,7 @@ from magfusion.simulation.demo_site import demo_site
 from magfusion.units import Array
 
 STEP = 0.01  # s
-LONGEST = 90.0  # s
+MAX_DURATION = 90.0  # s
 LINE = 2.0  # s; between lines of guidance
 SPEED = 0.9  # rad/s
 TREMBLE = 0.3  # rad/s, rms of each axis
@@ -147,7 +147,7 @@ def target_in(line: str) -> Array | None:
     return result / np.linalg.norm(result) if result.any() else None
 
 
-def turn(hand: Hand, directory: Path, duration: float = LONGEST) -> HandRun:
+def turn(hand: Hand, directory: Path, duration: float = MAX_DURATION) -> HandRun:
     """Turn a sensor while ``magfusion calibrate magnetometer -`` guides, as a process."""
     site, output = directory / "site.yaml", directory / "magnetometer"
     save_site(hand.site, site)
@@ -214,7 +214,7 @@ def turn_many(count: int, seed: int, *, follows: bool) -> list[HandRun]:
     for k in range(count):
         hand = Hand(uncalibrated_site(), np.random.default_rng([seed, k]), follows=follows)
         with tempfile.TemporaryDirectory() as directory:
-            result.append(turn(hand, Path(directory), LONGEST if follows else 30.0))
+            result.append(turn(hand, Path(directory), MAX_DURATION if follows else 30.0))
     return result
 
 

@@ -32,7 +32,7 @@ from magfusion.simulation.motion import Rests, random_walk_motion
 from magfusion.units import DEGREE
 
 HZ, LEVER = 20.0, (0.05, -0.02, 0.03)  # m
-MOST_NEES, INSIDE, LEAST_ROLL = 7.5, 0.9, 1.5
+MAX_NEES, INSIDE, MIN_ROLL = 7.5, 0.9, 1.5
 
 
 def run_free() -> Site:
@@ -77,7 +77,7 @@ def rows_of(seed: int, duration: float) -> tuple[list[Row], list[str]]:
         assert states.pose_cov is not None
         rows.append(row_of(seed, "z", estimator, states, trust, truth))
         roll = np.sqrt(np.einsum("i,nij,j->n", axis, states.pose_cov[:, :3, :3], axis))
-        if np.min(roll) < LEAST_ROLL:
+        if np.min(roll) < MIN_ROLL:
             faults.append(f"{estimator}, seed {seed}: roll {np.min(roll) / DEGREE:.0f} deg")
     return rows, faults
 
@@ -88,7 +88,7 @@ def faults_of(rows: list[Row]) -> list[str]:
     for estimator in ("smooth", "ekf"):
         own = [row for row in rows if row.estimator == estimator]
         nees, inside = (float(np.mean([getattr(r, k) for r in own])) for k in ("nees", "inside"))
-        if nees > MOST_NEES:
+        if nees > MAX_NEES:
             faults.append(f"{estimator}: mean NEES {nees:.2f} of 5")
         if inside < INSIDE:
             faults.append(f"{estimator}: {inside:.0%} within three sigma")

@@ -37,7 +37,7 @@ GAIN = 2.7  # that nobody tells the estimator
 NOISE = 1e-10  # T, of either part of a phasor before its amplitude is taken
 FIRST_HZ, STEP_HZ = 5000.0, 20.0
 LIMIT = 0.01  # of the range, and rad
-FEW = 0.1  # share of epochs that a hemisphere may leave a second place
+MAX_AMBIGUOUS_SHARE = 0.1  # share of epochs that a hemisphere may leave a second place
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def run(seed: int, epochs: int = 100) -> ReceiverResult:
     passed = (
         bool(np.all(worst <= LIMIT))
         and bool(np.all(both))
-        and bool(np.mean(alone) >= 1.0 - FEW)
+        and bool(np.mean(alone) >= 1.0 - MAX_AMBIGUOUS_SHARE)
         and 1.5 <= nees <= 6.0
         and "roll_open" in codes
     )

@@ -39,7 +39,7 @@ from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_lo
 from magfusion.simulation.motion import Rests
 
 FAR_M, FAR_RAD = 0.3, 0.4  # further off, an epoch is at another hypothesis
-MOST_WRONG = 0.05  # of the epochs
+MAX_WRONG_SHARE = 0.05  # of the epochs
 LARGE_NEES, SILENT_NEES = 12.0, 20.0
 
 
@@ -81,7 +81,7 @@ class Row:
     @property
     def success(self) -> bool:
         """Whether some start is right."""
-        return self.wrong < MOST_WRONG
+        return self.wrong < MAX_WRONG_SHARE
 
     @property
     def silent(self) -> bool:

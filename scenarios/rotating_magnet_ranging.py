@@ -46,7 +46,7 @@ from magfusion.simulation.wells import TwoWells, drawn_steel
 from magfusion.units import Array
 
 PUBLISHED, BETTER = 0.03, 5.0
-LEAST_NEES, MOST_NEES = 4.0, 8.0
+MIN_NEES, MAX_NEES = 4.0, 8.0
 MOMENT, MOMENT_SIGMA = 300.0, 0.02  # A m^2, relative
 SPEED_HZ, NOISE = 3.0, 2e-11  # Hz, T/sqrt(Hz)
 RATE_HZ = 50.0
@@ -338,7 +338,7 @@ def judge_ranging(rows: list[Row]) -> Judgement:
     """Judge the draws of a case."""
     share = np.array([row.error_m / row.distance_m for row in rows])
     mean = float(np.mean([row.nees for row in rows]))
-    first, good = rows[0], LEAST_NEES <= mean <= MOST_NEES
+    first, good = rows[0], MIN_NEES <= mean <= MAX_NEES
     if first.case == CROSSING.name:
         good = good and rms(share) <= PUBLISHED / BETTER
     return Judgement(

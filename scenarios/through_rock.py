@@ -34,7 +34,7 @@ from magfusion.simulation.motion import random_walk_motion
 WRONG = 3.0  # factor of the declared conductivity
 DIRECTIONS = np.array([[1.0, 0.9, 0.4], [-0.9, 1.0, -0.5], [-1.0, -0.8, 0.6], [0.8, -1.0, -0.3]])
 SPACING = 0.03  # of the tones, relative
-LEAST_NEES, MOST_NEES = 1.0, 6.0
+MIN_NEES, MAX_NEES = 1.0, 6.0
 ESTIMATED = "threefold, estimated"
 
 
@@ -192,8 +192,8 @@ def judgement(place: Place, rows: list[Row], config: Config) -> Judgement:
     nees = float(np.mean([row.nees for row in own]))
     bound = 2.0 * place.bound if config.surface else place.bound
     # A half space has no conductivity of a full one: what is found is what stands in for it.
-    certain = config.surface or (off <= 3.0 and nees >= LEAST_NEES)
-    good = worst <= bound and certain and nees <= MOST_NEES
+    certain = config.surface or (off <= 3.0 and nees >= MIN_NEES)
+    good = worst <= bound and certain and nees <= MAX_NEES
     return Judgement(place.name, worst, bound, off, nees, good)
 
 

@@ -16,7 +16,7 @@ RATE_HZ, FIELD_KNOTS_HZ = 20e3, 1000.0
 EARTH_WORLD = np.array([0.0, 2e-5, -4.5e-5])  # T
 BITS, RANGE = 16, 100e-6  # T
 PIECE = 0.01  # s
-LEAST_SAMPLES = 8  # of a slot; for shorter ones the converter is a faster one
+MIN_SAMPLES = 8  # of a slot; for shorter ones the converter is a faster one
 SOURCE_PPM = 20.0  # of a crystal
 UNKNOWN = 0.0123  # s; when a cycle of a clock of its own begins
 PLATE_KNOTS_HZ = 50.0
@@ -41,7 +41,7 @@ PRIOR = """  motion_prior:
 
 def sample_times(config: Config) -> Array:
     """Return the stamps of the converter (s)."""
-    rate_hz = RATE_HZ * np.ceil(LEAST_SAMPLES * config.slots * config.rate_hz / RATE_HZ)
+    rate_hz = RATE_HZ * np.ceil(MIN_SAMPLES * config.slots * config.rate_hz / RATE_HZ)
     return np.asarray(np.arange(int(config.duration * rate_hz)) / rate_hz)
 
 

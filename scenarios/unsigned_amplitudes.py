@@ -24,7 +24,7 @@ PITCH, ACROSS, MOMENT = 1.0, 4, 10.0  # m, coils, A m^2
 FIRST_HZ, STEP_HZ = 500.0, 20.0
 BOX = np.array([[-1.2, -1.2, 0.5], [1.2, 1.2, 1.6]])  # m
 HZ, SIGMA, MODEL_ERROR = 10.0, 1e-10, 0.001
-MOST_NEES, INSIDE, WORSE = 9.0, 0.9, 2.0
+MAX_NEES, INSIDE, WORSE = 9.0, 0.9, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def faults_of(rows: list[Row]) -> list[str]:
         here, there = (
             float(np.sqrt(np.mean([r.position_mm**2 for r in some]))) for some in (own, with_signs)
         )
-        if nees > MOST_NEES:
+        if nees > MAX_NEES:
             faults.append(f"{estimator}: mean NEES {nees:.2f} of 6")
         if inside < INSIDE:
             faults.append(f"{estimator}: {inside:.0%} within three sigma")

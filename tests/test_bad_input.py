@@ -18,7 +18,7 @@ from conftest import Refuse, Worked
 
 from magfusion.cli import main
 from magfusion.files.atomic import whole_directory, whole_file
-from magfusion.files.stream import LARGEST_RECORD
+from magfusion.files.stream import MAX_RECORD
 
 MAGFUSION = [sys.executable, "-m", "magfusion"]
 Change = Callable[[dict[str, Any]], object]
@@ -76,7 +76,7 @@ STREAMS = {
         b'{"imu": {"time": -1e308, "gyro": [0,0,0], "accel": [0,0,9.8]}}\n',
         "line 1.*time",
     ),
-    "a line without end": ("json", b"0" * (LARGEST_RECORD + 10), "line 1: is larger than 16 MiB"),
+    "a line without end": ("json", b"0" * (MAX_RECORD + 10), "line 1: is larger than 16 MiB"),
     "a record cut inside": (
         "msgpack",
         _PACKED + _PACKED[:20],
@@ -109,7 +109,7 @@ def test_a_stream_that_is_none_is_refused_by_its_place(mistake: str, worked: Wor
 
 @pytest.mark.slow
 def test_a_record_that_is_too_large_is_passed_over_where_that_is_asked(worked: Worked) -> None:
-    given = b"0" * (LARGEST_RECORD + 10) + b"\n" + json.dumps(_IMU).encode() + b"\n"
+    given = b"0" * (MAX_RECORD + 10) + b"\n" + json.dumps(_IMU).encode() + b"\n"
     status, findings = _navigate(worked, given, "json", "--keep-going")
     assert status == 0
     assert "line 1: is larger than" in findings

@@ -13,7 +13,7 @@ from example_log import EPOCH_NS, example_log
 from magfusion.errors import InputError
 from magfusion.files.fields import read_fields, write_fields
 from magfusion.files.log import read_log, write_log
-from magfusion.files.parquet_bounds import MOST_ROWS
+from magfusion.files.parquet_bounds import MAX_ROWS
 from magfusion.files.plausible import check_imu
 from magfusion.files.table import Span
 from magfusion.files.trajectory_table import QUATERNION, read_trajectory
@@ -384,7 +384,7 @@ def test_an_acceleration_of_one_is_in_g_only_if_it_keeps_its_direction() -> None
 
 @pytest.mark.slow
 def test_a_small_file_of_many_rows_is_refused_and_a_part_of_it_read(tmp_path: Path) -> None:
-    walk, rows = tmp_path / "walk", MOST_ROWS + 1
+    walk, rows = tmp_path / "walk", MAX_ROWS + 1
     write_log(example_log(), walk)
     names = pa.parquet.read_schema(walk / "imu.parquet").names
     zeros = pa.array(np.zeros(rows, dtype=np.float32))

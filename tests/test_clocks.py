@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magfusion.estimation.data_checks.field_rotation import LAG_STEP, LONGEST_LAG, Clocks
+from magfusion.estimation.data_checks.field_rotation import LAG_STEP, MAX_LAG, Clocks
 from magfusion.model.samples import ImuSamples, Log, Waveform
 
 LATE = 0.14  # s
@@ -22,7 +22,7 @@ def _recorded() -> tuple[Clocks, np.ndarray]:
     noise = 1e-7 * rng.standard_normal(field.shape)
     clocks.change = -np.cross(np.roll(clocks.rate, round(LATE / LAG_STEP), axis=0), field) + noise
     clocks.field = field
-    count = int(LONGEST_LAG / LAG_STEP)
+    count = int(MAX_LAG / LAG_STEP)
     explained = []
     for shift in range(-count, count + 1):
         inner = slice(count, len(time) - count)

@@ -32,7 +32,7 @@ from magfusion.receiver.windows import LockinSettings
 # What a job is, is known without these; of all jobs together, the list, without anything heavy.
 HEAVY = {"gtsam", "matplotlib", "rerun", "scipy.signal", "scipy.stats"}
 HEAVY_OF_ALL = HEAVY | {"filterpy", "msgpack", "numpy", "pandas", "pyarrow", "rosbags", "scipy"}
-MOST_MEMORY = 80.0  # MB
+MAX_MEMORY = 80.0  # MB
 HELP = """
 import sys
 from pathlib import Path
@@ -76,7 +76,7 @@ def test_the_list_of_commands_is_shown_without_anything_heavy() -> None:
     assert "Usage: magfusion" in done.stdout
     memory, *modules = done.stderr.split()
     assert not set(modules) & HEAVY_OF_ALL
-    assert float(memory) < MOST_MEMORY
+    assert float(memory) < MAX_MEMORY
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 from magfusion.estimation.data_checks.detection import DetectionFilter, switched, without_silence
 from magfusion.estimation.data_checks.signal import (
-    LEAST_SNR,
+    MIN_SNR,
     BeaconDetection,
     undetected_findings,
 )
@@ -100,7 +100,7 @@ def passing(range_m: Array) -> BeaconDetection:
     field = np.maximum(5.0 * (20.0 / range_m) ** 3, 0.7)
     snr = np.stack([field, np.full(len(field), 100.0)], axis=1)
     time = STEP * np.arange(len(snr))
-    return BeaconDetection(time, ("A", "B"), snr, SIGMA * snr, snr > LEAST_SNR)
+    return BeaconDetection(time, ("A", "B"), snr, SIGMA * snr, snr > MIN_SNR)
 
 
 def test_who_drives_out_of_range_is_not_told_that_a_beacon_was_switched_off() -> None:

@@ -24,8 +24,8 @@ from magfusion.model.samples import Waveform
 PAGE = (Path(__file__).parents[1] / "docs" / "kit.md").read_text()
 PLAYED = re.search(r"^```\n(pactl .*\nparecord .*) &\n(paplay .*)\n```$", PAGE, re.M)
 SHOWN = re.findall(r"`(magfusion view .*?)`", PAGE)
-MOST_COMMANDS = 12
-LARGEST_ERROR = 2e-3  # m, after alignment
+MAX_COMMANDS = 12
+MAX_ERROR = 2e-3  # m, after alignment
 __all__ = ["server"]
 
 
@@ -44,7 +44,7 @@ def test_at_most_twelve_commands() -> None:
     assert PLAYED is not None
     assert len(SHOWN) == 1
     played = sum(len(group.splitlines()) for group in PLAYED.groups())
-    assert len(commands()) + played + len(SHOWN) <= MOST_COMMANDS
+    assert len(commands()) + played + len(SHOWN) <= MAX_COMMANDS
 
 
 def test_a_voltage_beyond_full_scale_is_refused() -> None:
@@ -98,7 +98,7 @@ def test_a_stranger_plays_a_walk_and_finds_it(
             _end_with_walk(tmp_path / "heard.wav")
             command = command.replace("walk/recording.wav", "heard.wav")
         shown = run(f"{command} --json" if command.startswith("magfusion evaluate") else command)
-    assert json.loads(shown)["ate_m"] < LARGEST_ERROR
+    assert json.loads(shown)["ate_m"] < MAX_ERROR
     report = json.loads((tmp_path / "heard_run" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.demodulation.beacon_selection import (
-    MOST_AT_START,
+    MAX_START_BEACONS,
     select_detected,
     select_strongest,
 )
@@ -179,7 +179,7 @@ def test_the_strongest_of_many_start_and_the_others_wait(building: Site) -> None
     site = replace(building, beacons=beacons)
     fields = simulate_fields(site, states, SIGMA, np.random.default_rng(0))
     log, some = select_strongest(log_of(fields), site)
-    assert len(some.beacons) == MOST_AT_START
+    assert len(some.beacons) == MAX_START_BEACONS
     assert some.every_beacon == site.beacons
     assert log.fields is not None
     assert log.fields.channels == some.channels

@@ -194,7 +194,7 @@ def test_the_report_says_what_is_told_and_what_is_not(log: Path, tmp_path: Path)
 def test_wound_coils_locate_it_with_both_mirrors_and_one_in_front() -> None:
     result = scenario.run(7, 60)
     assert result.mirrored == 1.0
-    assert result.alone >= 1.0 - scenario.FEW
+    assert result.alone >= 1.0 - scenario.MAX_AMBIGUOUS_SHARE
     assert result.roll_open
     assert result.largest_place_percent <= 100.0 * scenario.LIMIT
     # Of all epochs, not of each as the scenario's verdict has it: noise takes one to 0.0107 rad.

@@ -35,7 +35,7 @@ EVIL = '<script>alert("x")</script>'
 N = 400
 ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-4
 VOID = {"meta", "img", "path", "circle", "br"}
-LARGEST = 5_000_000  # bytes
+MAX_BYTES = 5_000_000  # bytes
 TRUST = Trust(
     (
         Finding("beacon_fault", f"The field of beacon {EVIL} is false.", Verdict.DOUBTFUL),
@@ -82,7 +82,7 @@ class Page(HTMLParser):
 
     def check(self) -> None:
         """Hold it to what every page must keep to."""
-        assert len(self.source.encode()) < LARGEST
+        assert len(self.source.encode()) < MAX_BYTES
         assert all(address.startswith("data:image/png;base64,") for address in self.addresses)
         assert not {"script", "link", "iframe", "object"} & set(self.tags)
         assert not re.search(r"(?i)https?:|@import|url\(", self.source)
@@ -224,7 +224,7 @@ def test_of_a_failed_job_the_page_lies_with_what_was_found(tmp_path: Path) -> No
 
 def test_pictures_are_inside_as_far_as_there_is_room(tmp_path: Path) -> None:
     (tmp_path / "beacon.png").write_bytes(b"\x89PNG")
-    (tmp_path / "large.png").write_bytes(bytes(LARGEST))
+    (tmp_path / "large.png").write_bytes(bytes(MAX_BYTES))
     write_report(tmp_path, _figures())
     result = Page(tmp_path / PAGE)
     result.check()

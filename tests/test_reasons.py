@@ -3,7 +3,7 @@
 from typing import Any
 
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.verdict import MOST_TEXTS, trust_figures
+from magfusion.results.verdict import MAX_TEXTS, trust_figures
 
 
 def reasons(*findings: Finding) -> list[Any]:
@@ -34,8 +34,8 @@ def test_of_two_values_that_of_the_more_important_finding_is_the_remedy() -> Non
 
 
 def test_more_sentences_than_a_reader_reads_are_counted() -> None:
-    (row,) = reasons(*(Finding("gap", f"Gap {k}.") for k in range(MOST_TEXTS + 2)))
-    assert row["text"].count("Gap") == MOST_TEXTS
+    (row,) = reasons(*(Finding("gap", f"Gap {k}.") for k in range(MAX_TEXTS + 2)))
+    assert row["text"].count("Gap") == MAX_TEXTS
     assert row["text"].endswith("2 more of this kind.")
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.batch.between_epochs import at_rate
-from magfusion.estimation.batch.preprocessed_log import LONGEST_STEP
+from magfusion.estimation.batch.preprocessed_log import MAX_STEP
 from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.model.samples import Log, Waveform
@@ -81,7 +81,7 @@ def test_the_batch_errs_less_than_the_navigator(resting: tuple[Log, Smoothed, Tr
 
 def test_states_are_made_where_no_field_comes(resting: tuple[Log, Smoothed, Trajectory]) -> None:
     _, result, _ = resting
-    assert np.max(np.diff(result.states.time)) <= LONGEST_STEP
+    assert np.max(np.diff(result.states.time)) <= MAX_STEP
     assert np.max(np.diff(result.fields.time)) > 30.0  # s
     np.testing.assert_array_equal(result.states.time[result.epoch], result.fields.time)
 

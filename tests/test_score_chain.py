@@ -70,7 +70,7 @@ def test_of_many_columns_each_channel_whitens_those_that_it_feels(
     fields = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))
     at = states_in(result.estimate.values).rows(fields.epoch), result.calibration, blocks
     few = fields.linearize(*at).by_calibration
-    monkeypatch.setattr(phasors, "MANY_COLUMNS", 10**6)
+    monkeypatch.setattr(phasors, "MIN_SPARSE_COLUMNS", 10**6)
     every = fields.linearize(*at).by_calibration
     assert few is not None
     assert every is not None

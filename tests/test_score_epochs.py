@@ -17,7 +17,7 @@ from magfusion.estimation.online_integrity.score_epochs import (
     Sums,
     add_epochs,
 )
-from magfusion.estimation.online_integrity.score_online import MOST_WAITING
+from magfusion.estimation.online_integrity.score_online import MAX_WAITING
 from magfusion.estimation.solve import sparse_rows
 from magfusion.model.parameters import BEACON_POSITION
 
@@ -34,7 +34,7 @@ def _waiting() -> tuple[Navigator, Sums, list[Epoch]]:
     score._scored_at = np.inf
     with pytest.MonkeyPatch.context() as patch:  # a new onset would not let them wait
         patch.setattr(recent_steps, "ONSET_INTERVAL", np.inf)
-        _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
+        _feed(navigator, small, LAST, LAST + MAX_WAITING - 1)
     assert score._sums is not None
     return navigator, score._sums, list(score._waiting)
 
@@ -51,7 +51,7 @@ def _assert_alike(result: Sums, expected: Sums) -> None:
 def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     navigator, sums, waiting = _waiting()
     requested = navigator._loop.running.update.score.targets
-    assert len(waiting) == MOST_WAITING - 1
+    assert len(waiting) == MAX_WAITING - 1
     offsets = {epoch.predicted.calibration.time_offset for epoch in waiting}
     assert len(offsets) > 1  # what an epoch is linearised with changes from one to the next
     rest = zero_velocity(np.zeros(1, dtype=np.int64), 0.01)

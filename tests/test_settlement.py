@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.settlement import (
     AVERAGED,
-    MOST_AVERAGES,
+    MAX_AVERAGES,
     Movement,
     Rest,
     movements,
@@ -156,10 +156,10 @@ def test_a_step_is_no_steady_movement() -> None:
 
 def test_a_rest_of_weeks_keeps_its_size() -> None:
     rest, phasor = BEGUN, BEGUN.predicted
-    for k in range(5 * MOST_AVERAGES):
+    for k in range(5 * MAX_AVERAGES):
         rest = rest.with_epoch(AVERAGED * k, phasor)
-    assert len(rest.count) <= MOST_AVERAGES
-    assert rest.count.sum() == 5 * MOST_AVERAGES
+    assert len(rest.count) <= MAX_AVERAGES
+    assert rest.count.sum() == 5 * MAX_AVERAGES
     assert np.all(np.diff(rest.time) > 0.0)
 
 

@@ -33,11 +33,11 @@ from magfusion.units import Array
 soundfile = pytest.importorskip("soundfile")
 
 DURATION = 22.0  # s
-LARGEST_ERROR = 2e-3  # m
+MAX_ERROR = 2e-3  # m
 TOLERANCE = 2  # samples
 FAST = 5e-5  # of a card's clock
-LARGEST_OF_FAST = 4e-4  # m
-LARGEST_NEES = 15.0  # of six numbers
+MAX_FAST_ERROR = 4e-4  # m
+MAX_NEES = 15.0  # of six numbers
 
 
 def moving_tones(rng: np.random.Generator, duration: float) -> Array:
@@ -159,7 +159,7 @@ def test_a_recording_with_slips_is_smoothed(
     assert any("are lost at" in note for note in imported["notes"])
     header = yaml.safe_load((tmp_path / "log" / "log.yaml").read_text())
     check_slips(header["audio"]["slips"], slips)
-    assert figures["ate_m"] < LARGEST_ERROR
+    assert figures["ate_m"] < MAX_ERROR
     assert figures["verdict"] == "trustworthy"
 
 
@@ -194,9 +194,9 @@ def test_a_walk_by_a_fast_card_is_navigated_as_it_is_smoothed(tmp_path: Path) ->
     assert source.slips == []
     states = navigated(log, received, WARM_UP, tmp_path / "site.yaml")
     error = error_of(log, states, WARM_UP)
-    assert error < min(LARGEST_OF_FAST, 2.0 * figures["ate_m"])
+    assert error < min(MAX_FAST_ERROR, 2.0 * figures["ate_m"])
     assert figures["verdict"] == "trustworthy"
-    assert figures["nees_mean"] < LARGEST_NEES
+    assert figures["nees_mean"] < MAX_NEES
     assert {state["verdict"] for state in states} == {"trustworthy"}
 
 
@@ -213,5 +213,5 @@ def test_slips_are_corrected_live(walk: Log, slips: list[tuple[int, int]], tmp_p
         assert f"(sample {slip.place})" in sentence
     check_slips([(s.place - round(WARM_UP * RATE_HZ), s.missing) for s in source.slips], slips)
     states = navigated(walk, received, WARM_UP, tmp_path / "site.yaml")
-    assert error_of(walk, states, WARM_UP) < LARGEST_ERROR
+    assert error_of(walk, states, WARM_UP) < MAX_ERROR
     assert not any("are lost at" in sentence for sentence in source.close())

@@ -41,8 +41,8 @@ CHANNELS = "front-left,front-right,rear-left,rear-right"
 FORM = f"format=s24le rate={RATE_HZ} channels=4 channel_map={CHANNELS}"
 DURATION = 20.0  # s
 QUIET = 1.0  # s of records before the walk
-LARGEST_ERROR = 4e-4  # m
-LATEST_START = 3.0  # s; of the first state after the first samples
+MAX_ERROR = 4e-4  # m
+MAX_START_DELAY = 3.0  # s; of the first state after the first samples
 MATCHED = 37  # every so many samples are compared
 Sigma = TypeVar("Sigma", BeaconSigma, MagnetometerSigma)
 
@@ -167,9 +167,9 @@ def test_a_played_walk_is_navigated(
     log = on_card(walk, fast)
     states = navigated(log, records, begin, tmp_path / "site.yaml")
     assert len(states) > 100
-    assert states[0]["time"] - begin < LATEST_START
+    assert states[0]["time"] - begin < MAX_START_DELAY
     assert {state["verdict"] for state in states} == {"trustworthy"}
-    assert error_of(log, states, begin) < LARGEST_ERROR
+    assert error_of(log, states, begin) < MAX_ERROR
 
 
 def of_card(site: Site) -> Site:

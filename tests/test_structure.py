@@ -27,7 +27,7 @@ from house import (
     upward,
 )
 
-LARGEST_FOLDER = 25  # files of a room of `estimation`
+MAX_FOLDER = 25  # files of a room of `estimation`
 INTEGRITY = 32  # until one bank of hypotheses has replaced what it holds
 
 
@@ -106,7 +106,7 @@ def test_the_rooms_of_the_estimators_stay_small() -> None:
     assert house["loose_files"] == 0
     files = {place.name: count for place, count in files_by_folder("estimation").items()}
     assert files.pop("integrity") <= INTEGRITY
-    assert max(files.values()) <= LARGEST_FOLDER, files
+    assert max(files.values()) <= MAX_FOLDER, files
 
 
 def test_nothing_else_is_loose_at_the_root() -> None:

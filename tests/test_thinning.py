@@ -10,8 +10,8 @@ from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.graph import imu_decimation as thinning
 from magfusion.estimation.graph.imu_decimation import (
     JOINED,
+    MAX_TURN,
     MIN_JOINED_STEPS,
-    MOST_TURN,
     preintegrate_stream,
     thinned,
 )
@@ -107,7 +107,7 @@ def test_a_change_of_bias_moves_joined_steps_as_the_single_ones():
     joined, single = both(increments)
     rate = np.linalg.norm(increments.gyro_body - GYRO_BIAS, axis=1)
     steps = np.array(BY) * 0.01
-    turn = np.minimum(np.max(rate) * steps, MOST_TURN)
+    turn = np.minimum(np.max(rate) * steps, MAX_TURN)
     tolerances = turn**2 / 12.0  # of the series in the turn of a step
     other = gtsam.imuBias.ConstantBias(ACCEL_BIAS + 1e-3, GYRO_BIAS - 1e-4)
     still = gtsam.NavState(gtsam.Rot3(), np.zeros(3), np.zeros(3))

@@ -19,7 +19,7 @@ from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.imu_checks import judge_biases
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
-from magfusion.estimation.online_integrity.recovery import LONGEST_WAIT, Attempts
+from magfusion.estimation.online_integrity.recovery import MAX_WAIT, Attempts
 from magfusion.estimation.online_integrity.running import nothing
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.log import write_log
@@ -125,7 +125,7 @@ def test_a_platform_that_nothing_explains_is_lost_until_it_is_found(
     lost_epochs = [state.time for state in states if state.is_lost]
     # Five epochs tell a loss, the last of which is half a second before.
     assert 20.0 < lost_epochs[0] < 23.5
-    assert 26.0 < lost_epochs[-1] < 27.0 + LONGEST_WAIT + 0.5
+    assert 26.0 < lost_epochs[-1] < 27.0 + MAX_WAIT + 0.5
     result = [state for state in states if state.time > lost_epochs[-1]]
     assert result[0].verdict is Verdict.DOUBTFUL
     assert "found_again" in codes(result[:1])
@@ -358,7 +358,7 @@ def test_attempts_are_spaced_out_and_never_given_up() -> None:
         if attempts.due(0.1 * k):
             times.append(0.1 * k)
     assert times[0] == 0.0
-    assert np.max(np.diff(times)) == pytest.approx(LONGEST_WAIT, abs=0.11)
+    assert np.max(np.diff(times)) == pytest.approx(MAX_WAIT, abs=0.11)
     assert len(times) < 30
     attempts.over()
     assert attempts.due(40.1)

@@ -44,7 +44,7 @@ def test_what_is_allowed_exists(everything: list[words.Finding]) -> None:
     [
         ("fields_heard", [("part", "heard")]),
         ("HeldMotion", [("whole", "held_motion")]),
-        ("LEAST_TOLD", [("part", "told")]),
+        ("MIN_TOLD", [("part", "told")]),
         ("_found", [("whole", "found")]),
         ("found_world", []),
         ("unfolded", []),

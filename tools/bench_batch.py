@@ -20,7 +20,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
 
-LONGEST_HOURS = 48.0  # to which the times are scaled
+MAX_HOURS = 48.0  # to which the times are scaled
 IMU_RATE_HZ = 100.0
 EPOCH_S = 60.0
 FIELD_SIGMA = 2e-10  # T
@@ -66,7 +66,7 @@ def bench_batch(hours: float, seed: int) -> dict[str, float]:
     result = smooth(log, site)
     seconds = time.process_time() - began
     bare = 0.5 * (before + bare_loop(site, log.imu))
-    scale = LONGEST_HOURS / hours
+    scale = MAX_HOURS / hours
     cov = result.states.pose_cov
     assert cov is not None
     error = result.states.position_world - POSITION_WORLD

@@ -38,7 +38,7 @@ import magfusion as package
 from magfusion.cli import main as magfusion
 
 MEMORY = 2 << 30  # bytes
-LONGEST = 120.0  # s; a busy machine takes a minute for what takes seconds
+MAX_DURATION = 120.0  # s; a busy machine takes a minute for what takes seconds
 BATCH = 200  # cases a process
 CORPUS = Path(__file__).parents[1] / "tests" / "fuzz_corpus"
 
@@ -173,8 +173,8 @@ def run_batch(
         if done:
             break
         lines = _lines(scratch)
-        if lines and "began" in lines[-1] and time.monotonic() - lines[-1]["began"] > LONGEST:
-            hung = f"hung for {LONGEST:g} s"
+        if lines and "began" in lines[-1] and time.monotonic() - lines[-1]["began"] > MAX_DURATION:
+            hung = f"hung for {MAX_DURATION:g} s"
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
             break

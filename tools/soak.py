@@ -35,7 +35,7 @@ from magfusion.simulation.motion import Rests
 
 PIECE = 0.5  # s in a record
 CALM = 30.0  # s before each fault: a start needs about ten
-SHORTEST, LONGEST = 1.0, 600.0  # s of a silence
+MIN_SILENCE, MAX_SILENCE = 1.0, 600.0  # s of a silence
 FULL = 60.0  # s
 SPIKED = 0.02  # of the samples, while they have spikes
 WRONG = 2.0  # s
@@ -67,7 +67,7 @@ class Fault:
 def schedule(hours: float, each: int, rng: np.random.Generator) -> list[Fault]:
     """Return the faults, one after the other in random order."""
     kinds = rng.permutation(np.repeat(KINDS, each))
-    duration = np.exp(rng.uniform(np.log(SHORTEST), np.log(LONGEST), len(kinds)))
+    duration = np.exp(rng.uniform(np.log(MIN_SILENCE), np.log(MAX_SILENCE), len(kinds)))
     duration[kinds == "full_disk"] = FULL
     duration[np.isin(kinds, ("clock_step", "kill"))] = 0.0
     spare = 3600.0 * hours - CALM * (len(kinds) + 1)

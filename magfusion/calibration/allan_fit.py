@@ -20,10 +20,10 @@ from magfusion.calibration.allan import AllanVariance
 from magfusion.units import Array
 
 FLICKER = 2.0 * np.log(2.0) / np.pi
-LEAST_CLUSTERS = 2.0  # side by side, that a cluster time has
-LEAST_POINTS = 6  # cluster times that a fit needs
+MIN_CLUSTERS = 2.0  # side by side, that a cluster time has
+MIN_POINTS = 6  # cluster times that a fit needs
 SHAPE = 0.05  # relative: what an instrument may deviate from these four at any cluster time
-LEAST_WHITE = 5  # cluster times that separate white noise from a drift
+MIN_WHITE = 5  # cluster times that separate white noise from a drift
 CLEAN = 1.0  # chi square a degree of freedom of cluster times with white noise and a drift
 WHITE_SHARE = 0.5  # of an Allan variance, where its slope is that of white noise
 FILTERED = 6  # octaves at the beginning that an instrument's own filter may spoil
@@ -94,13 +94,13 @@ def fit_allan(result: AllanVariance, axis: int) -> AllanFit | None:
     An instrument's own filter makes short clusters smoother than white noise.  Where the fit does
     not match them, it begins at longer cluster times.
     """
-    enough = np.asarray(result.clusters >= LEAST_CLUSTERS)
+    enough = np.asarray(result.clusters >= MIN_CLUSTERS)
     usable = np.logical_and.reduce([result.octave, enough, result.variance[:, axis] > 0.0])
     tau, variance = result.tau[usable], result.variance[usable, axis]
     clusters = result.clusters[usable]
     best: AllanFit | None = None
     for first in range(FILTERED + 1):
-        if len(tau) - first < LEAST_POINTS:
+        if len(tau) - first < MIN_POINTS:
             break
         part = slice(first, None)
         fit = _fit(tau[part], variance[part], clusters[part])
@@ -119,7 +119,7 @@ def _white_slope(tau: Array, variance: Array, clusters: Array) -> Fitted | None:
     There the deviation has the slopes of quantization, white noise, walk and ramp; the fifth
     component of IEEE Std 952, the ramp, is also what a slow tone is at first.
     """
-    for count in range(len(tau), LEAST_WHITE - 1, -1):
+    for count in range(len(tau), MIN_WHITE - 1, -1):
         for first in range(min(FILTERED + 1, len(tau) - count + 1)):
             part = slice(first, first + count)
             fitted = _white_with_drift(tau[part], variance[part], 2.0 / clusters[part] + SHAPE**2)

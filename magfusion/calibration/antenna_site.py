@@ -22,7 +22,7 @@ from magfusion.model.physics.finite_size import coil_shape
 from magfusion.model.site import Beacon, Coil, Magnetometer, Site
 from magfusion.units import Array
 
-SMALLEST_KAPPA = 1e-9  # m^2; of coils of a tenth of a millimetre, which are points
+MIN_KAPPA = 1e-9  # m^2; of coils of a tenth of a millimetre, which are points
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def coils_of(beacon: Beacon, antenna: Antenna) -> Beacon:
 
 def _of_size(coil: Coil, kappa: float) -> Coil:
     """Return the coil as a circular, or long, coil of this size."""
-    if abs(kappa) < SMALLEST_KAPPA and coil.length is None:
+    if abs(kappa) < MIN_KAPPA and coil.length is None:
         return replace(coil, radius=None)
     radius, length = coil_shape(kappa, coil.length)
     return replace(coil, radius=radius, length=length)

@@ -21,9 +21,9 @@ SPACING = 0.5  # m; of the grid that seeds the search
 REACH = 1.5  # m; half the width of the grid
 CLEARANCE = 0.25  # m; nearer than this to a magnetometer no beacon is looked for
 STARTS = 4  # minima on the grid that are followed
-MOST_NUMBERS = 100_000  # of grid and phasors that are worked on at once
+MAX_NUMBERS = 100_000  # of grid and phasors that are worked on at once
 SAME = 0.01  # m; fits nearer to each other than this are one
-LARGEST_CONDITION = 1e7  # of the scaled Jacobian
+MAX_CONDITION = 1e7  # of the scaled Jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Arr
         )
     cost = np.full((len(seen), len(places)), np.inf)
     indices = np.flatnonzero(clear)
-    for some in np.array_split(indices, 1 + len(indices) * seen.shape[1] // MOST_NUMBERS):
+    for some in np.array_split(indices, 1 + len(indices) * seen.shape[1] // MAX_NUMBERS):
         basis, _ = np.linalg.qr(_columns(measured, places[some])[0])
         explained = np.einsum("gdm,rd->rgm", basis, seen)
         cost[:, some] = np.sum(seen**2, axis=-1)[:, None] - np.sum(explained**2, axis=-1)
@@ -226,7 +226,7 @@ def _inverse(jacobian: Array, reach: float) -> Array:
     safe = np.where(scale > 0.0, scale, 1.0)
     _, size, right = np.linalg.svd(jacobian / safe[..., None, :], full_matrices=False)
     short = jacobian.shape[-2] < jacobian.shape[-1]
-    if short or np.any(size[..., -1] * LARGEST_CONDITION < size[..., 0]):
+    if short or np.any(size[..., -1] * MAX_CONDITION < size[..., 0]):
         raise InputError(
             "the magnetometers do not determine the centre and the moments of the beacon; measure"
             " at more points, not along one line from it"

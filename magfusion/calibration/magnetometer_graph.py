@@ -21,7 +21,7 @@ from magfusion.units import Array
 
 GYRO_BIAS_KEY = gtsam.symbol("g", 0)
 COLUMNS = 17  # matrix, offset, dip, accelerometer bias, logarithm of the field's size
-MOST_STEPS = 40
+MAX_STEPS = 40
 MIN_COST_DECREASE = 1e-9  # relative decrease of the cost that ends the loop
 ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
 
@@ -175,7 +175,7 @@ def fit_graph(
         cov=readings.prior_cov(),
         steps=steps,
     )
-    result, own_cov = solve(graph, first, "magnetometer", MOST_STEPS, MIN_COST_DECREASE)
+    result, own_cov = solve(graph, first, "magnetometer", MAX_STEPS, MIN_COST_DECREASE)
     cov = np.zeros((COLUMNS, COLUMNS))
     cov[np.ix_(readings.active, readings.active)] = own_cov
     cov /= np.outer(readings.unit, readings.unit)

@@ -30,7 +30,7 @@ from magfusion.calibration.magnetometer_start import (
     starts,
 )
 from magfusion.calibration.sphere_fit import FIRST_SIGMA, sphere_fits
-from magfusion.calibration.static_field import LONGEST, StaticField, average, static_field
+from magfusion.calibration.static_field import MAX_WINDOW, StaticField, average, static_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
 from magfusion.model.field import skew
@@ -160,7 +160,7 @@ def _readings(
             " rest for three seconds in each position, or omit --positions"
         )
     offset = site.platform.imu.time_offset
-    window = np.minimum(stops.length, LONGEST)
+    window = np.minimum(stops.length, MAX_WINDOW)
     return average(waveform, imu, offset, known, stops.centre + offset, window)
 
 

@@ -1,6 +1,6 @@
 """A stream of samples at rest, of any length: even spacing, gaps, and whether it moved.
 
-Memory is bounded: Allan sums, and a summary of at most `MOST_BLOCKS` stretches.
+Memory is bounded: Allan sums, and a summary of at most `MAX_BLOCKS` stretches.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from magfusion.calibration.allan import AllanStream, AllanVariance
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.units import Array, BoolArray, IntArray
 
-MOST_BLOCKS = 4096
+MAX_BLOCKS = 4096
 MAX_CLOCKED = 10_000  # samples that show whether stamps are coarse
 COARSE = 0.02  # of a step
 BLOCK = 1.0  # s, of the shortest stretch
 GAP = 0.5  # of a step, by which three steps in a row are too long where a sample is missing
-LONGEST_FILL = 64  # samples missing in a row; beyond, nothing is filled in
+MAX_FILL = 64  # samples missing in a row; beyond, nothing is filled in
 ROWS = 1 << 14  # samples that are taken at once
 SHAKEN = 3.0  # times the usual scatter in a stretch
 STILL = 1e-6  # of the usual scatter, what rounding leaves of a frozen stretch
@@ -149,7 +149,7 @@ class RestStream:
 
     def _fill(self, values: Array, missing: IntArray) -> None:
         """Put samples on an even grid."""
-        long = np.flatnonzero(missing > LONGEST_FILL)
+        long = np.flatnonzero(missing > MAX_FILL)
         for part, gap in zip(
             np.split(np.arange(len(values)), long), [0, *missing[long]], strict=True
         ):
@@ -193,7 +193,7 @@ class RestStream:
             if len(self._pending) == self._per_block:
                 self._blocks.append(_merged(self._pending))
                 self._pending = []
-            if len(self._blocks) == MOST_BLOCKS:
+            if len(self._blocks) == MAX_BLOCKS:
                 pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
                 self._blocks = [_merged([a, b]) for a, b in pairs]
                 self._per_block *= 2

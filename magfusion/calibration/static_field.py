@@ -17,13 +17,13 @@ from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray
 
 PERIODS = 8.0  # of the lowest tone in a window; its taper leaves 6e-4 of it, less of the others
-SHORTEST = 0.2  # s; ten periods of the mains
-LONGEST = 2.0  # s; over which a gyro's bias turns less than it matters
+MIN_WINDOW = 0.2  # s; ten periods of the mains
+MAX_WINDOW = 2.0  # s; over which a gyro's bias turns less than it matters
 GAP = 3.5  # a gap is this many times what intervals are up to; two lost samples are none
 UP_TO = 95.0  # percent of the intervals, so that stamps of a host make no gaps
-SHORTEST_ALONE, MIN_WINDOW_SAMPLES = 0.05, 5.0  # s, samples; of a window without a gyro
+MIN_GYROLESS_WINDOW, MIN_WINDOW_SAMPLES = 0.05, 5.0  # s, samples; of a window without a gyro
 MIN_TURN_CHANGE = 0.05  # of all that the field changes by
-MOST_OF_WINDOW = 0.5  # that may pass without a sample, however long intervals are
+MAX_MISSING_WINDOW = 0.5  # that may pass without a sample, however long intervals are
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +45,11 @@ def window_length(site: Site) -> float:
     Raises InputError where a tone is too low for that.
     """
     lowest = min((float(np.min(b.tone_frequencies_hz)) for b in site.beacons), default=np.inf)
-    length = max(SHORTEST, PERIODS / lowest)
-    if length > LONGEST:
+    length = max(MIN_WINDOW, PERIODS / lowest)
+    if length > MAX_WINDOW:
         raise InputError(
             f"a tone at {lowest:g} Hz is too low to average out while the sensor rotates; switch"
-            f" that beacon off, or use tones above {PERIODS / LONGEST:g} Hz"
+            f" that beacon off, or use tones above {PERIODS / MAX_WINDOW:g} Hz"
         )
     return length
 
@@ -81,7 +81,9 @@ def static_alone(waveform: Waveform, site: Site) -> StaticField:
     time = waveform.time
     usual = float(np.median(np.diff(time)))
     length = (
-        window_length(site) if site.beacons else max(SHORTEST_ALONE, MIN_WINDOW_SAMPLES * usual)
+        window_length(site)
+        if site.beacons
+        else max(MIN_GYROLESS_WINDOW, MIN_WINDOW_SAMPLES * usual)
     )
     centre = np.arange(time[0] + 0.5 * length, time[-1] - 0.5 * length, length)
     window = np.full(len(centre), length)
@@ -143,7 +145,7 @@ def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
     """Return which windows have no gap in a stream."""
     step = np.diff(time)
     usual = max(float(np.median(step)), float(np.percentile(step, UP_TO)))
-    longest = min(GAP * usual, MOST_OF_WINDOW * float(np.min(window)))
+    longest = min(GAP * usual, MAX_MISSING_WINDOW * float(np.min(window)))
     gaps = np.flatnonzero(step > longest)
     first, last = centre - 0.5 * window, centre + 0.5 * window
     inside = (first > time[0] - usual) & (last < time[-1] + usual)

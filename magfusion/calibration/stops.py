@@ -9,7 +9,7 @@ from magfusion.model.site import MotionModel
 from magfusion.model.strapdown import resting
 from magfusion.units import DEGREE, Array
 
-SHORTEST = 1.5  # s; of a stop
+MIN_STOP = 1.5  # s; of a stop
 RATE = 0.05  # rad/s; a gyro's bias is below it, a turn by hand above
 SAME = 10.0 * DEGREE  # stops whose vertical and turn differ by less are one orientation
 
@@ -45,7 +45,7 @@ def find_stops(imu: ImuSamples, motion: MotionModel) -> Stops:
     still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     first, last = edges[::2], edges[1::2] - 1
-    long = imu.time[last] - imu.time[first] >= SHORTEST
+    long = imu.time[last] - imu.time[first] >= MIN_STOP
     first, last = first[long], last[long]
     rates = [
         float(np.linalg.norm(np.mean(imu.gyro_body[i : j + 1], axis=0)))

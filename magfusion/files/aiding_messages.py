@@ -18,14 +18,14 @@ from magfusion.files.messages import (
     pose_row,
     sure_pose_row,
 )
-from magfusion.model.aiding import LONGEST_INTERVAL, AidingSensor, Quantity
+from magfusion.model.aiding import MAX_INTERVAL, AidingSensor, Quantity
 from magfusion.model.physics.earth import east_north_up
 from magfusion.units import Array
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 POSE_COLUMNS = 7  # position and quaternion; a twist follows
-SHORTEST_QUATERNION = 0.5  # an attitude that was left unfilled is zero
-LONGEST_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a sample
+MIN_QUATERNION = 0.5  # an attitude that was left unfilled is zero
+MAX_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a sample
 
 
 def _fix_row(sensor: AidingSensor, message: Any) -> list[float]:
@@ -100,16 +100,16 @@ class SensorMessages:
     def _differences(self, poses: Array) -> tuple[Array, Array]:
         """Return what moves poses (n, 8) in their axes, the first of each period of the rate."""
         rate = self._sensor.rate_hz
-        poses = poses[np.linalg.norm(poses[:, 4:], axis=1) > SHORTEST_QUATERNION]
+        poses = poses[np.linalg.norm(poses[:, 4:], axis=1) > MIN_QUATERNION]
         period = np.floor(poses[:, 0] * rate * (1.0 + 1e-9))
         poses = poses[np.diff(period, prepend=-np.inf) > 0.0]
         self._last = poses[-1:]
         step, attitude = np.diff(poses[:, 0]), Rotation.from_quat(poses[:, 4:])
-        near = step <= LONGEST_STEP / rate
+        near = step <= MAX_STEP / rate
         first, second = attitude[:-1], attitude[1:]
         way, turn = np.diff(poses[:, 1:4], axis=0), (first.inv() * second).as_rotvec()
         if self._sensor.quantity == "relative_pose":
-            near &= step <= LONGEST_INTERVAL
+            near &= step <= MAX_INTERVAL
             moved = np.hstack([step[:, None], first.inv().apply(way), turn])
             return poses[1:, 0][near], moved[near]
         middle = first * Rotation.from_rotvec(0.5 * turn)

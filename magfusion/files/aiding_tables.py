@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.files.readings_table import rows_by_name
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.files.trajectory_table import QUATERNION, unit_rotation
-from magfusion.model.aiding import LONGEST_INTERVAL, AidingSamples, Quantity
+from magfusion.model.aiding import MAX_INTERVAL, AidingSamples, Quantity
 from magfusion.units import DEGREE, Array
 
 SENSOR, MARK = "sensor", "mark"
@@ -71,7 +71,7 @@ def _values(quantity: Quantity, table: Table) -> Array:
             # A time without a measurement, as of a range without an echo, has no number.
             value[:, i] = table.numbers((name,), nan=quantity != "relative_pose")[:, 0]
     if quantity == "relative_pose":
-        remedy = f"more than 0 s; of more than {LONGEST_INTERVAL:g} s they are not used"
+        remedy = f"more than 0 s; of more than {MAX_INTERVAL:g} s they are not used"
         table.refuse(value[:, 0] <= 0.0, "interval_s", value[:, 0], remedy)
         turn = unit_rotation(table).as_rotvec()
         return np.hstack([value[:, : -len(QUATERNION)], turn])

@@ -18,7 +18,7 @@ from magfusion.units import DEGREE, Array, BoolArray
 
 Angles = Literal["roll", "roll-pitch"]
 ANGLES: tuple[str, ...] = get_args(Angles)
-LEAST_ENTRIES = 12  # a plane through nine neighbours, and some to choose them from
+MIN_ENTRIES = 12  # a plane through nine neighbours, and some to choose them from
 
 _FORMAT = "magfusion_attitude_database"
 _FIELD = ("field_x", "field_y", "field_z")
@@ -75,10 +75,10 @@ def read_database(path: Path) -> AttitudeDatabase:
         raise InputError(
             f"{path}: cannot be read as Parquet ({reason}); build it again."
         ) from error
-    if len(table) < LEAST_ENTRIES:
+    if len(table) < MIN_ENTRIES:
         raise InputError(
             f"{path}: holds {len(table)} entries; build it from a log with at least"
-            f" {LEAST_ENTRIES} different attitudes."
+            f" {MIN_ENTRIES} different attitudes."
         )
     values = {name: _numbers(table, name, path) for name in _COLUMNS}
     for name, limit in zip(_RPY, _LIMIT_DEG, strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from magfusion.errors import InputError
-from magfusion.files.table import LARGEST_TIME_NS, Span
+from magfusion.files.table import MAX_TIME_NS, Span
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.bandpass import BandFilter, BandSampler
 from magfusion.model.response import NOMINAL_T_PER_V
@@ -27,8 +27,8 @@ AXES: tuple[Literal["x", "y", "z"], ...] = ("x", "y", "z")
 SYNC = "sync"
 SUFFIXES = (".wav", ".flac", ".w64", ".caf", ".aiff")
 PIECE = 1 << 14  # samples of every channel; 0.4 MB of three
-MOST_NAMED = 8  # slips in a sentence
-LEAST_PULSES = 3
+MAX_LISTED = 8  # slips in a sentence
+MIN_PULSES = 3
 RATE_TOLERANCE = 1e-7  # of rounding
 EDGE_TOLERANCE = 1e-3  # s; of a pulse about the even clock: a GNSS receiver has 1e-7
 Count = Annotated[int, Field(ge=1)]
@@ -43,7 +43,7 @@ class AudioEntry(StrictModel):
     channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1)
     full_scale_v: float = Field(gt=0.0, le=1e6)  # voltage of a sample of 1 (V)
     rate_hz: float = Field(ge=1.0, le=1e7)  # of the samples on the log's clock
-    begin_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)  # stamp of the first sample
+    begin_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)  # stamp of the first sample
     # of each place where samples are lost: number of the first sample after it, and of the lost
     slips: list[Annotated[list[Count], Field(min_length=2, max_length=2)]] = Field(
         default_factory=list
@@ -200,8 +200,8 @@ def slip_text(slips: Sequence[Sequence[int]], rate_hz: float, first: int = 0) ->
         f" {(place + before) / rate_hz:.3f} s (sample {place})"
         for (place, count), before in zip(slips, before_each[:-1].tolist(), strict=True)
     ][first:]
-    return ", ".join(words[:MOST_NAMED]) + f", and at {len(words) - MOST_NAMED} more places" * (
-        len(words) > MOST_NAMED
+    return ", ".join(words[:MAX_LISTED]) + f", and at {len(words) - MAX_LISTED} more places" * (
+        len(words) > MAX_LISTED
     )
 
 
@@ -323,7 +323,7 @@ def _rate_by_pulses(path: Path, entry: AudioEntry, edges: Array, channel: int) -
     for place, missing in entry.slips[::-1]:
         edges = edges + missing * (edges >= place)
     second = np.round((edges - edges[:1]) / entry.rate_hz)
-    if len(edges) >= LEAST_PULSES and np.ptp(second) > 0:
+    if len(edges) >= MIN_PULSES and np.ptp(second) > 0:
         rate_hz, first = np.polyfit(second, edges, 1)
         if np.max(np.abs(edges - first - rate_hz * second)) < EDGE_TOLERANCE * rate_hz:
             return float(rate_hz)

@@ -21,8 +21,8 @@ from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.pose_rows import PoseRows
 from magfusion.files.row_stamps import batches_finding, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, all_strays, counted_back, stray_finding
-from magfusion.files.table import LARGEST_NUMBER, Span
+from magfusion.files.stray_stamps import MAX_GAP, all_strays, counted_back, stray_finding
+from magfusion.files.table import MAX_NUMBER, Span
 from magfusion.model.aiding import AidingSamples, AidingSensor
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -244,7 +244,7 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
 def _in_order(stream: _Stream) -> _Stream:
     """Return a stream sorted by the times of its samples, where the stamps are others, too."""
     # What is infinite is no measurement either.
-    values = np.where(np.abs(stream.values) < LARGEST_NUMBER, stream.values, np.nan)
+    values = np.where(np.abs(stream.values) < MAX_NUMBER, stream.values, np.nan)
     stray = all_strays(stream.time_ns)
     findings = stream.findings + stray_finding(stream.name, stream.time_ns[stray])
     time_ns, values = stream.time_ns[~stray], values[~stray]
@@ -285,7 +285,7 @@ def _refuse_steps(streams: Collection[_Stream], span: Span) -> None:
 def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
     """Return the messages that have a sample, and report the others."""
     declared += stream.findings
-    jumps = np.diff(stream.time_ns) > LONGEST_GAP / NANOSECOND
+    jumps = np.diff(stream.time_ns) > MAX_GAP / NANOSECOND
     if jumps.any():
         raise InputError(
             f"{stream.place}: the message stamped {stream.time_ns[1:][np.argmax(jumps)]} ns is more"

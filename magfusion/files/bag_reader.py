@@ -15,10 +15,10 @@ from magfusion.files.bag_recovery import Recovered, recovered
 from magfusion.files.bag_topics import UNFINISHED, bag_files, files_in
 
 # Of the files of one recording: what a recorder buffers, and of short ones a part.
-MOST_OVERLAP_NS, MOST_OVERLAP = 1_000_000_000, 0.5
+MAX_OVERLAP_NS, MAX_OVERLAP = 1_000_000_000, 0.5
 # Messages of an overlap, times those of one recording at most, and their least number: of two
 # recordings at the same time there are twice as many.
-MOST_DENSE, MIN_SHARED = 1.5, 10.0
+MAX_DENSITY, MIN_SHARED = 1.5, 10.0
 
 
 def place_of(paths: Sequence[Path]) -> str:
@@ -153,8 +153,8 @@ def refuse_overlap(reader: AnyReader, topic: str) -> None:
             for one, own in ((first, of_first), (second, of_second))
         )
         usual = sum(c.msgcount for c in of_first) / (first.end_time - first.start_time)
-        twofold = len(earlier | later) > MOST_DENSE * max(MIN_SHARED, usual * (end - begin))
-        if end - begin > min(MOST_OVERLAP_NS, MOST_OVERLAP * shorter) or twofold:
+        twofold = len(earlier | later) > MAX_DENSITY * max(MIN_SHARED, usual * (end - begin))
+        if end - begin > min(MAX_OVERLAP_NS, MAX_OVERLAP * shorter) or twofold:
             raise InputError(
                 f"{first.path} and {second.path} both hold {topic} at the same time, from"
                 f" {begin} to {end} ns; give the path of one."

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from magfusion.files.lost_rows import MOST_TWICE
+from magfusion.files.lost_rows import MAX_DUPLICATED
 from magfusion.files.messages import (
     FIELD,
     IMU,
@@ -78,7 +78,7 @@ class Messages(NamedTuple):
     def unstamped(self) -> bool:
         """Whether all headers have one stamp, and times of arrival distinguish the messages."""
         same = len(self.stamps) > 1 and bool(np.all(self.stamps == self.stamps[0]))
-        return same and bool(np.mean(np.diff(self.arrived) <= 0) <= MOST_TWICE)
+        return same and bool(np.mean(np.diff(self.arrived) <= 0) <= MAX_DUPLICATED)
 
 
 def unstamped_text(name: str, stamp_ns: int) -> str:

@@ -24,9 +24,9 @@ from magfusion.units import AnyArray
 
 MAGIC = b"magfusion state\n"
 VERSION = 22  # to be raised with every change of what a run keeps
-LARGEST_CONTENT = 1 << 28  # bytes
+MAX_CONTENT = 1 << 28  # bytes
 # MessagePack reserves what a list announces before it reads it, on each of 1024 levels.
-LONGEST_LIST = 1 << 14
+MAX_LIST = 1 << 14
 DTYPES = ("<f8", "<c16", "<i8", "|b1")
 _ARRAY = {"dtype", "shape", "data"}
 _HEADER = struct.Struct("<16sIQ32sQ")
@@ -117,7 +117,7 @@ def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
     if not os.path.lexists(path):
         return None
     start = _HEADER.size + _DIGEST
-    whole = _read(path, start + LARGEST_CONTENT + 1)
+    whole = _read(path, start + MAX_CONTENT + 1)
     position, own_key, length = _header(whole, path, key)
     content = memoryview(whole)[start:]
     digest = sha256(whole[: _HEADER.size])
@@ -129,8 +129,8 @@ def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
             content,
             object_hook=_array,
             ext_hook=_no_extension,
-            max_array_len=LONGEST_LIST,
-            max_map_len=LONGEST_LIST,
+            max_array_len=MAX_LIST,
+            max_map_len=MAX_LIST,
         )
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
         raise InputError(f"{path}: holds no plain data ({error}); run without --resume") from error
@@ -190,7 +190,7 @@ def _array(result: dict[str, Any]) -> dict[str, Any] | AnyArray:
         and isinstance(data, bytes)
         and isinstance(shape, list)
         and len(shape) <= 8
-        and all(type(size) is int and 0 <= size <= LARGEST_CONTENT for size in shape)
+        and all(type(size) is int and 0 <= size <= MAX_CONTENT for size in shape)
         and prod(shape) * np.dtype(dtype).itemsize == len(data)
     ):
         raise ValueError("an array whose shape does not fit its data")

@@ -7,8 +7,8 @@ import numpy as np
 from magfusion.files.lost_rows import copied_rows
 from magfusion.units import NANOSECOND, Array, BoolArray, IntArray
 
-MOST_BACK = 1.0  # s; no message is late by more
-FEW = 2  # rows out of order, of a late message
+MAX_STEP_BACK = 1.0  # s; no message is late by more
+MAX_LATE_ROWS = 2  # rows out of order, of a late message
 DENSE = 1.5  # times the rows of the time before or after: two runs make twice as many
 # Times the longest steps but the rarest: within bursts of rows their rate is no measure.
 WIDE, RARE = 2.0, 0.99
@@ -60,8 +60,12 @@ def clock_set_back(time_ns: IntArray, values: Array) -> ClockSetBack | None:
     older = back - np.searchsorted(highest, first, "right")
     newer = np.searchsorted(lowest, last, "right") - back
     size = last - first
-    many = (older > FEW) & (newer > FEW) & (size > WIDE * np.quantile(np.diff(ordered), RARE))
-    is_step = many & ((size * NANOSECOND > MOST_BACK) | _dense(ordered, first, last, step))
+    many = (
+        (older > MAX_LATE_ROWS)
+        & (newer > MAX_LATE_ROWS)
+        & (size > WIDE * np.quantile(np.diff(ordered), RARE))
+    )
+    is_step = many & ((size * NANOSECOND > MAX_STEP_BACK) | _dense(ordered, first, last, step))
     if not is_step.any():
         return None
     k = int(np.argmax(is_step))

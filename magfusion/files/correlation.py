@@ -14,7 +14,7 @@ from magfusion.units import Array
 _NAMES = ("group", "owner", "kind", "component")
 _COLUMNS = (*_NAMES, "sigma", "correlation")
 ROUNDING = 1e-9  # of a coefficient, and of the diagonal's one
-SMALLEST = 1e-14  # eigenvalue of a correlation that can be inverted
+MIN_EIGENVALUE = 1e-14  # eigenvalue of a correlation that can be inverted
 
 
 def write_correlation(correlation: Correlation, sigma: Array, path: Path) -> None:
@@ -64,4 +64,4 @@ def _is_correlation(result: Array, size: int) -> bool:
     if size == 0 or result.shape != (size, size) or not np.all(np.isfinite(result)):
         return False
     uneven = max(np.max(np.abs(result - result.T)), np.max(np.abs(np.diagonal(result) - 1.0)))
-    return bool(uneven < ROUNDING and np.linalg.eigvalsh(result)[0] > SMALLEST)
+    return bool(uneven < ROUNDING and np.linalg.eigvalsh(result)[0] > MIN_EIGENVALUE)

@@ -12,7 +12,7 @@ from magfusion.files.plain_table import refuse_damaged_text
 from magfusion.model.field_map import COMPONENTS, FieldMap
 from magfusion.units import Array
 
-LARGEST_DEVIATION = 3.0  # logarithm of the gain, or rad; a factor of 20 or half a turn
+MAX_DEVIATION = 3.0  # logarithm of the gain, or rad; a factor of 20 or half a turn
 _POSITION = ("position_x", "position_y", "position_z")
 _WEIGHTS = tuple(f"weight_{i}" for i in range(COMPONENTS))
 _UPPER = tuple(zip(*np.triu_indices(COMPONENTS), strict=True))
@@ -79,7 +79,7 @@ def read_field_maps(path: Path) -> dict[str, FieldMap]:
     for name, result in maps.items():
         with np.errstate(over="ignore", invalid="ignore"):
             largest = float(np.max(np.abs(result.mean(result.points_world)[0])))
-        if not largest <= LARGEST_DEVIATION:
+        if not largest <= MAX_DEVIATION:
             raise InputError(
                 f"{path}: the map of {name} deviates from the model by {largest:.3g} (logarithm of"
                 " the gain, or rad); learn it again."

@@ -18,8 +18,8 @@ _IMAGINARY = ("im_x", "im_y", "im_z")
 _UPPER = np.triu_indices(3)
 _COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
 SAME_TIME = 1e-7  # s; less is rounding of stamps
-LEAST_ROWS = 8  # fewer may be zero in a component by their pose
-LEAST_SERIES = 6  # components of channels; signs of so many are all positive once in 64 poses
+MIN_ROWS = 8  # fewer may be zero in a component by their pose
+MIN_SERIES = 6  # components of channels; signs of so many are all positive once in 64 poses
 _AMPLITUDE, _MAGNETOMETER = "amplitude", "magnetometer"
 _PARTS = {axis: (f"re_{axis}", f"im_{axis}") for axis in "xyz"}
 _LAYOUT = TableLayout(
@@ -104,12 +104,12 @@ def refuse_unsigned(fields: FieldSamples, frequency_hz: Array, place: Path | str
     part out of phase at zero. `frequency_hz`: of each channel, 0 of a level.
     """
     alternating = np.asarray(frequency_hz) > 0.0
-    if fields.axes != "xyz" or not fields.signed or len(fields) < LEAST_ROWS:
+    if fields.axes != "xyz" or not fields.signed or len(fields) < MIN_ROWS:
         return
     phasor = fields.phasor_sensor[:, alternating].reshape(len(fields), -1)
     measured = phasor[:, np.isfinite(phasor).any(axis=0)]
     unsigned = (measured.real >= 0.0) & (measured.imag == 0.0) | np.isnan(measured)
-    if measured.shape[1] >= LEAST_SERIES and unsigned.all():
+    if measured.shape[1] >= MIN_SERIES and unsigned.all():
         raise InputError(
             f"{place}: the components of three axes are never negative and have no part out of"
             " phase, so they are amplitudes, which are for receivers of one axis; give re and im"
@@ -253,7 +253,7 @@ def _refuse_blind(table: Table, path: Path, axes: str) -> None:
     """Refuse a component without a number, or with zeros that are none."""
     parts = np.stack([table.numbers(_PARTS[axis], nan=True) for axis in axes])
     blind = np.all((parts == 0.0) | np.isnan(parts), axis=(1, 2))
-    if len(table) < LEAST_ROWS or not np.any(blind) or np.all(blind):
+    if len(table) < MIN_ROWS or not np.any(blind) or np.all(blind):
         return
     none = [axis for axis, nothing in zip(axes, blind, strict=True) if nothing]
     names = ", ".join(f"re_{axis}, im_{axis}" for axis in none)

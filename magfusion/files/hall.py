@@ -8,13 +8,13 @@ import numpy as np
 from pydantic import AfterValidator, Field, PlainValidator
 
 from magfusion.errors import InputError
-from magfusion.files.site_values import LARGEST_DISTANCE, refusal
+from magfusion.files.site_values import MAX_DISTANCE, refusal
 from magfusion.files.yaml_files import StrictModel, read_yaml
 from magfusion.model.hall import Hall, Mounts, Prism
 from magfusion.units import Array
 
-LEAST_SIZE = 0.1  # m; nothing smaller is a hall
-MOST_CORNERS = 200
+MIN_SIZE = 0.1  # m; nothing smaller is a hall
+MAX_CORNERS = 200
 
 
 def _number(value: object) -> bool:
@@ -22,7 +22,7 @@ def _number(value: object) -> bool:
         isinstance(value, int | float)
         and not isinstance(value, bool)
         and math.isfinite(value)
-        and abs(value) <= LARGEST_DISTANCE
+        and abs(value) <= MAX_DISTANCE
     )
 
 
@@ -34,17 +34,17 @@ def _polygon(value: object) -> Array:
     """Read the corners of a polygon whose edges do not cross."""
     if (
         isinstance(value, list)
-        and 3 <= len(value) <= MOST_CORNERS
+        and 3 <= len(value) <= MAX_CORNERS
         and all(_pair(corner) for corner in value)
     ):
         corners = np.array(value, dtype=float)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-        long = np.all(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) >= LEAST_SIZE)
+        long = np.all(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) >= MIN_SIZE)
         if long and not _crossed(edges):
             return corners
     raise refusal(
         "give the corners in their order, three or more lists [x, y] in m, such that no edges cross"
-        f" and none is shorter than {LEAST_SIZE:g} m"
+        f" and none is shorter than {MIN_SIZE:g} m"
     )
 
 
@@ -84,8 +84,8 @@ def _heights(value: object) -> Array:
 
 
 def _has_size(prism: Array) -> Array:
-    if prism[1] - prism[0] < LEAST_SIZE:
-        raise refusal(f"give two heights at least {LEAST_SIZE:g} m apart")
+    if prism[1] - prism[0] < MIN_SIZE:
+        raise refusal(f"give two heights at least {MIN_SIZE:g} m apart")
     return prism
 
 
@@ -127,7 +127,7 @@ class UseEntry(StrictModel):
 
     polygon_m: _Polygon | None = None
     height_m: _Heights | None = None
-    margin_m: Annotated[float, Field(ge=0.0, le=LARGEST_DISTANCE)] = 0.0
+    margin_m: Annotated[float, Field(ge=0.0, le=MAX_DISTANCE)] = 0.0
 
 
 def _first_version(value: int) -> int:

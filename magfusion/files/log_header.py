@@ -7,7 +7,7 @@ from pydantic import Field
 
 from magfusion.files.audio import AudioEntry
 from magfusion.files.drive_columns import column_names
-from magfusion.files.table import LARGEST_TIME_NS, TIME, Span, TableLayout, find_table, read_table
+from magfusion.files.table import MAX_TIME_NS, TIME, Span, TableLayout, find_table, read_table
 from magfusion.files.yaml_files import StrictModel, read_yaml
 
 HEADER = "log.yaml"
@@ -20,7 +20,7 @@ class LogHeader(StrictModel):
 
     magfusion_log: Literal[1]
     name: str
-    epoch_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+    epoch_ns: int = Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)
     source: str
     audio: AudioEntry | None = None
 

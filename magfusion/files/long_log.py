@@ -11,7 +11,7 @@ from magfusion.files.drive_columns import column_names, drive_columns, rotor_col
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log_header import is_log, read_header
-from magfusion.files.lost_rows import MOST_MISSING
+from magfusion.files.lost_rows import MAX_MISSING
 from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import beyond_range, check_field, check_imu
@@ -70,7 +70,7 @@ class Samples:
         kept = np.diff(piece.time, prepend=self._newest) > 0.0
         beyond = beyond_range(piece.values)
         # Else the unit is wrong.
-        kept &= ~(np.isnan(piece.values).any(axis=1) | (beyond & (np.mean(beyond) <= MOST_MISSING)))
+        kept &= ~(np.isnan(piece.values).any(axis=1) | (beyond & (np.mean(beyond) <= MAX_MISSING)))
         self._time, self._values, self._at = piece.time[kept], piece.values[kept], 0
         if not len(self._time):
             return

@@ -9,7 +9,7 @@ from magfusion.files.plausible import beyond_range
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray, IntArray
 
-MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
+MAX_MISSING, MAX_DUPLICATED = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
 def copied_rows(time_ns: IntArray, values: Array) -> BoolArray:
@@ -60,7 +60,7 @@ class LostRows(NamedTuple):
         copies = copied_rows(time_ns, values)
         twice = (np.diff(time_ns, prepend=time_ns[:1] - 1) == 0) & ~copies
         absent, beyond = np.isnan(values).any(axis=1), beyond_range(values)
-        if np.sum(beyond) > MOST_MISSING * len(beyond):
+        if np.sum(beyond) > MAX_MISSING * len(beyond):
             beyond[:] = False
         return cls(
             copies, np.asarray(twice), np.asarray(absent & ~copies), beyond & ~absent & ~copies
@@ -78,8 +78,8 @@ class LostRows(NamedTuple):
             return False, False
         count = np.sum(~self.copies)
         return (
-            bool(np.sum(self.twice) > MOST_TWICE * count),
-            bool(np.sum(self.absent) > MOST_MISSING * count),
+            bool(np.sum(self.twice) > MAX_DUPLICATED * count),
+            bool(np.sum(self.absent) > MAX_MISSING * count),
         )
 
     def findings(self, stream: str) -> tuple[Finding, ...]:

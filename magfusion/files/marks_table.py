@@ -11,7 +11,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import column_names
 from magfusion.files.table import (
-    LARGEST_TIME_NS,
+    MAX_TIME_NS,
     TIME,
     Span,
     Table,
@@ -23,7 +23,7 @@ from magfusion.model.marks import SILENT, UNKNOWN_SLOT, Marks, marks_of_column
 from magfusion.units import Array, BoolArray, IntArray
 
 SLOT, END = "slot", "end_ns"
-LARGEST_SLOT = 10_000
+MAX_SLOT = 10_000
 _SLOT_LAYOUT = TableLayout(numbers=(SLOT,), repeats=True, strays=True)
 _BURSTS = TableLayout(numbers=(), integers=(TIME, END, SLOT), repeats=True)
 _REMEDY = f"write the number of a coil's slot, or {SILENT} where none is driven"
@@ -49,7 +49,7 @@ def slots_of(values: Array) -> IntArray:
 
 def is_slot(values: Array) -> BoolArray:
     """Return which numbers are slots, or missing."""
-    whole = (np.round(values) == values) & (values >= SILENT) & (values <= LARGEST_SLOT)
+    whole = (np.round(values) == values) & (values >= SILENT) & (values <= MAX_SLOT)
     return np.asarray(whole | np.isnan(values))
 
 
@@ -64,9 +64,9 @@ def _read_column(path: Path, span: Span) -> Marks:
 def _read_bursts(path: Path, span: Span) -> Marks:
     table = read_table(path, _BURSTS, Span(span.epoch_ns))
     end_ns, slot = table.integers(END), table.integers(SLOT)
-    table.refuse(np.abs(end_ns) > LARGEST_TIME_NS, END, end_ns, "write nanoseconds")
+    table.refuse(np.abs(end_ns) > MAX_TIME_NS, END, end_ns, "write nanoseconds")
     table.refuse(end_ns <= table.time_ns, END, end_ns, f"write a time after the row's {TIME}")
-    table.refuse((slot < SILENT) | (slot > LARGEST_SLOT), SLOT, slot, _REMEDY)
+    table.refuse((slot < SILENT) | (slot > MAX_SLOT), SLOT, slot, _REMEDY)
     _refuse_overlap(table, end_ns)
     begin, beyond = span.bounds_ns
     inside = (table.time_ns >= begin) & (end_ns <= beyond)
@@ -74,7 +74,7 @@ def _read_bursts(path: Path, span: Span) -> Marks:
 
 
 def _refuse_overlap(table: Table, end_ns: IntArray) -> None:
-    before = np.append(-LARGEST_TIME_NS, end_ns)[:-1]
+    before = np.append(-MAX_TIME_NS, end_ns)[:-1]
     remedy = "before the burst of the row above has ended: end that earlier, or begin this later"
     table.refuse(table.time_ns < before, TIME, table.time_ns, remedy)
 

@@ -10,8 +10,8 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 
-MOST_ROWS = 10_000_000  # nine hours at 300 Hz; what is made of them takes 2 GiB
-MOST_BYTES = 1 << 30  # of a CSV, and of what a group of rows unfolds to
+MAX_ROWS = 10_000_000  # nine hours at 300 Hz; what is made of them takes 2 GiB
+MAX_BYTES = 1 << 30  # of a CSV, and of what a group of rows unfolds to
 BATCH = 1 << 17  # rows decoded at once
 
 
@@ -29,10 +29,10 @@ def refuse_unfolding(
             for k in range(group.num_columns)
             if group.column(k).path_in_schema in names
         )
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise InputError(
                 f"{path}: {group.num_rows} rows unfold to {size >> 20} MiB; write groups of at most"
-                f" {MOST_BYTES >> 20} MiB."
+                f" {MAX_BYTES >> 20} MiB."
             )
 
 
@@ -60,9 +60,9 @@ def read_batches(
                 first = row + int(inside[0])
             kept.append(batch.slice(inside[0], inside[-1] + 1 - inside[0]))
             count += len(kept[-1])
-        if count > MOST_ROWS:
+        if count > MAX_ROWS:
             raise InputError(
-                f"{path}: holds more than {MOST_ROWS} rows in the part to use; use a shorter one,"
+                f"{path}: holds more than {MAX_ROWS} rows in the part to use; use a shorter one,"
                 " by --start and --end."
             )
         row += len(batch)

@@ -15,8 +15,8 @@ import numpy as np
 from magfusion.errors import InputError
 
 Kind = TypeVar("Kind")
-LARGEST = 1e100  # its square is a number, too
-_TOO_LARGE = f"is beyond {LARGEST:g}"
+MAX_NUMBER = 1e100  # its square is a number, too
+_TOO_LARGE = f"is beyond {MAX_NUMBER:g}"
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,9 @@ def _as_it_is(kind: Any, data: Any) -> Any:
         dtype = np.dtype(get_args(get_args(kind)[1])[0])
         if not isinstance(data, np.ndarray) or data.dtype != dtype:
             raise ValueError(f"is no array of {dtype}")
-        if np.issubdtype(dtype, np.inexact) and np.any(np.abs(data[np.isfinite(data)]) > LARGEST):
+        if np.issubdtype(dtype, np.inexact) and np.any(
+            np.abs(data[np.isfinite(data)]) > MAX_NUMBER
+        ):
             raise ValueError(_TOO_LARGE)
         return data
     if get_origin(kind) is Literal:
@@ -101,7 +103,7 @@ def _as_it_is(kind: Any, data: Any) -> Any:
         return data
     if type(data) is not kind and not (kind is float and type(data) is int):
         raise ValueError(f"is no {kind.__name__}")
-    if kind is float and LARGEST < abs(data) < np.inf:
+    if kind is float and MAX_NUMBER < abs(data) < np.inf:
         raise ValueError(_TOO_LARGE)
     return None if data is None else kind(data)
 

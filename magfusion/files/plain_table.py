@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.units import Array, IntArray
 
-LARGEST_POSITION = 1e7  # m; no survey leaves the Earth
+MAX_POSITION = 1e7  # m; no survey leaves the Earth
 POSITION = ("position_x", "position_y", "position_z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")  # R = Rz(yaw) Ry(pitch) Rx(roll)
@@ -87,8 +87,8 @@ def poses(table: pa.Table, path: Path) -> tuple[Array, Array]:
     """
     position = np.stack([numbers(table, name, path) for name in POSITION], axis=1)
     farthest = np.max(np.abs(position), axis=1)
-    wanted = f"a position in m, at most {LARGEST_POSITION:g}"
-    refuse_rows(farthest > LARGEST_POSITION, path, "columns of the position", farthest, wanted)
+    wanted = f"a position in m, at most {MAX_POSITION:g}"
+    refuse_rows(farthest > MAX_POSITION, path, "columns of the position", farthest, wanted)
     if has_angles(table.column_names):
         angles = np.stack([numbers(table, name, path) for name in ANGLES], axis=1)
         return position, Rotation.from_euler("xyz", angles, degrees=True).as_matrix()

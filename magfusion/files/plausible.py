@@ -10,13 +10,13 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Platform
 from magfusion.units import Array, BoolArray
 
-LARGEST_FIELD = 1e-3  # T; twenty times the Earth's
-LARGEST_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
+MAX_FIELD = 1e-3  # T; twenty times the Earth's
+MAX_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
 FASTEST_RATE = 80.0  # rad/s; beyond the range of any
-LARGEST_RATE_IN_DEGREES = ImuModel.gyro_range  # deg/s, and as much written for rad/s
-LARGEST_FORCE = 1e4  # m/s^2
+MAX_RATE_IN_DEGREES = ImuModel.gyro_range  # deg/s, and as much written for rad/s
+MAX_FORCE = 1e4  # m/s^2
 # A sample beyond these is no measurement, in whatever unit.
-_LARGEST_SAMPLES = {  # by the number of columns
+_MAX_SAMPLES = {  # by the number of columns
     6: np.repeat([ImuModel.gyro_range, ImuModel.accel_range], 3),
     **dict.fromkeys((1, 2, 3), np.array(Magnetometer.field_range)),
 }
@@ -32,8 +32,8 @@ MAX_TEST_SAMPLES = 20_000  # samples
 ONE_WAY = 0.9  # length of the mean of directions that are one
 WEIGHT_IN_G = (0.9, 1.1)  # where gravity is 9.8 m/s^2
 # Of the median, what nine in ten samples exceed: of a specific force without gravity half.
-LEAST_WEIGHT = 0.6
-SHORTEST_STEP = 2e-5  # s; faster than any inertial sensor
+MIN_WEIGHT = 0.6
+MIN_STEP = 2e-5  # s; faster than any inertial sensor
 
 
 def beyond_range(values: Array) -> BoolArray:
@@ -42,7 +42,7 @@ def beyond_range(values: Array) -> BoolArray:
     `values` (n, columns): rate and specific force (rad/s, m/s^2), or up to three components of a
     field (T); of other columns no range is known.
     """
-    largest = _LARGEST_SAMPLES.get(values.shape[1], np.array(np.inf))
+    largest = _MAX_SAMPLES.get(values.shape[1], np.array(np.inf))
     return np.asarray((np.abs(values) > largest).any(axis=1))
 
 
@@ -82,8 +82,8 @@ def check_imu(imu: ImuSamples, place: str) -> None:
     turning = np.sum(imu.gyro_body**2, axis=1)
     turning = turning[turning <= np.quantile(turning, SOUND)]
     rate, changes = float(np.sqrt(np.mean(turning))), bool(np.ptp(turning) > 0.0)
-    fast = rate > FASTEST_RATE or (rate > LARGEST_RATE and not _keeps_its_direction(imu))
-    if fast and rate < LARGEST_RATE_IN_DEGREES and changes:
+    fast = rate > FASTEST_RATE or (rate > MAX_RATE and not _keeps_its_direction(imu))
+    if fast and rate < MAX_RATE_IN_DEGREES and changes:
         raise InputError(
             f"{place}: the angular rate is {rate:.3g} rad/s (RMS), so it is probably in deg/s;"
             " multiply it by pi/180."
@@ -95,19 +95,19 @@ def check_imu(imu: ImuSamples, place: str) -> None:
         )
     sizes = np.linalg.norm(imu.accel_body, axis=1)
     force, least = (float(np.quantile(sizes, share)) for share in (0.5, 0.1))
-    if force > LARGEST_FORCE:
+    if force > MAX_FORCE:
         raise InputError(
             f"{place}: the specific force is {force:.3g} m/s^2 (median), which no accelerometer"
             " measures; repair the sensor, or give it in m/s^2."
         )
-    in_g = WEIGHT_IN_G[0] < force < WEIGHT_IN_G[1] and least > LEAST_WEIGHT * force
+    in_g = WEIGHT_IN_G[0] < force < WEIGHT_IN_G[1] and least > MIN_WEIGHT * force
     if in_g and _keeps_its_direction(imu):
         raise InputError(
             f"{place}: the specific force is {force:.3g} m/s^2 (median), so it is probably in g;"
             " multiply it by 9.80665."
         )
-    step = float(np.median(np.diff(imu.time))) if len(imu) > 1 else SHORTEST_STEP
-    if step < SHORTEST_STEP:
+    step = float(np.median(np.diff(imu.time))) if len(imu) > 1 else MIN_STEP
+    if step < MIN_STEP:
         raise InputError(
             f"{place}: samples are {step:.3g} s apart (median), so that the times are probably"
             " not in nanoseconds; multiply them, by 1000 if they are in microseconds."
@@ -122,7 +122,7 @@ def _keeps_its_direction(imu: ImuSamples) -> bool:
     """
     step = np.diff(imu.time, append=imu.time[-1:])
     step[step > CHECKED_DURATION] = 0.0
-    count = max(1, int(CHECKED_DURATION / max(float(np.median(step)), SHORTEST_STEP)))
+    count = max(1, int(CHECKED_DURATION / max(float(np.median(step)), MIN_STEP)))
     if len(imu) < 2 * count:
         return True  # too little to contradict the size
     ahead: list[Array] = []
@@ -147,7 +147,7 @@ def check_field(size: Array, place: str) -> None:
     Raises InputError naming ``place``, what was found and the likely factor.
     """
     field = float(np.median(size)) if len(size) else 0.0
-    if field > LARGEST_FIELD:
+    if field > MAX_FIELD:
         raise InputError(
             f"{place}: the field is {field:.3g} T (median), so it is probably in another unit;"
             " divide nanotesla by 1e9, microtesla by 1e6, gauss by 1e4."

@@ -8,9 +8,9 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
 QUATERNION_TOLERANCE = 1e-3  # of its length from one; more is reported
-MOST_OFF = 0.01  # of a quaternion's length from one: rounding, or one that was interpolated
-FEW_OFF = 0.1  # of the rows, whose quaternions may be worse
-LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
+MAX_LENGTH_ERROR = 0.01  # of a quaternion's length from one: rounding, or one that was interpolated
+MAX_UNNORMALIZED_SHARE = 0.1  # of the rows, whose quaternions may be worse
+MIN_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
 class PoseRows(NamedTuple):
@@ -31,8 +31,8 @@ class PoseRows(NamedTuple):
         if quaternion is not None:
             absent |= np.isnan(quaternion).any(axis=1)
             length = np.linalg.norm(quaternion, axis=1)
-        zeros = ~absent & (length < LEAST_QUATERNION)
-        off = ~absent & ~zeros & ~(np.abs(length - 1.0) <= MOST_OFF)
+        zeros = ~absent & (length < MIN_QUATERNION)
+        off = ~absent & ~zeros & ~(np.abs(length - 1.0) <= MAX_LENGTH_ERROR)
         kept = ~(absent | zeros | off)
         if quaternion is not None:
             quaternion = quaternion / np.where(kept, length, 1.0)[:, None]
@@ -56,7 +56,7 @@ class PoseRows(NamedTuple):
     @property
     def refused(self) -> BoolArray:
         """Which rows have quaternions that are none, where there are too many for an accident."""
-        too_many = np.sum(self.off) > FEW_OFF * np.sum(self.kept | self.off)
+        too_many = np.sum(self.off) > MAX_UNNORMALIZED_SHARE * np.sum(self.kept | self.off)
         return np.asarray(self.off & too_many)
 
     def findings(self, stream: str) -> tuple[Finding, ...]:

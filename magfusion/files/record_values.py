@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
 
 from magfusion.files.marks_table import is_slot, slots_of
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
+from magfusion.files.table import MAX_NUMBER, MAX_TIME_NS
 from magfusion.units import Array, ComplexArray, IntArray
 
-MAX_TIME_S = 1e-9 * LARGEST_TIME_NS  # s
+MAX_TIME_S = 1e-9 * MAX_TIME_NS  # s
 
 
 def numbers(value: object, what: str, *, missing: bool = False) -> Array:
@@ -22,9 +22,7 @@ def numbers(value: object, what: str, *, missing: bool = False) -> Array:
         result = np.empty(0, dtype=object)
     if missing and result.dtype.kind == "O":
         result = _with_nulls(result)
-    sound = (
-        np.abs(result) < LARGEST_NUMBER if result.dtype.kind in "iuf" else np.zeros(1, dtype=bool)
-    )
+    sound = np.abs(result) < MAX_NUMBER if result.dtype.kind in "iuf" else np.zeros(1, dtype=bool)
     if missing and result.dtype.kind == "f":
         sound |= np.isnan(result)
     if not np.all(sound):

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from magfusion.files.lost_rows import MOST_TWICE
+from magfusion.files.lost_rows import MAX_DUPLICATED
 from magfusion.model.batches import spread_batches
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NANOSECOND, Array, IntArray
 
-LONGEST_BATCH = 2.0  # s between two stamps; coarser ones do not determine the times of samples
+MAX_BATCH = 2.0  # s between two stamps; coarser ones do not determine the times of samples
 MIN_BATCHES = 3
-LARGEST_BATCH = 4.0  # times the usual size, unless it took as much longer to fill
+MAX_BATCH_RATIO = 4.0  # times the usual size, unless it took as much longer to fill
 ROUNDING_NS = 500  # of stamps in microseconds
-MOST_COPIES = 0.5  # of the rows with the stamp of the one above; more are one row, written again
+MAX_COPIES = 0.5  # of the rows with the stamp of the one above; more are one row, written again
 
 
 def separate_stamps(time_ns: IntArray, values: Array) -> IntArray | None:
@@ -23,14 +23,14 @@ def separate_stamps(time_ns: IntArray, values: Array) -> IntArray | None:
     None; the last sample of a batch keeps its stamp.
     """
     twice = np.diff(time_ns) == 0
-    if not len(twice) or np.mean(twice) <= MOST_TWICE:
+    if not len(twice) or np.mean(twice) <= MAX_DUPLICATED:
         return None
     copies = ((values[1:] == values[:-1]) | np.isnan(values[1:])).all(axis=1)
     last = np.append(np.flatnonzero(~twice), len(time_ns) - 1)
-    if np.mean(copies[twice]) > MOST_COPIES or len(last) < MIN_BATCHES:
+    if np.mean(copies[twice]) > MAX_COPIES or len(last) < MIN_BATCHES:
         return None
     step = float(np.median(np.diff(time_ns[last])))
-    if step * NANOSECOND > LONGEST_BATCH or _is_rounded(time_ns[last], round(step)):
+    if step * NANOSECOND > MAX_BATCH or _is_rounded(time_ns[last], round(step)):
         return None
     if _stalls(time_ns[last], np.diff(last, prepend=-1)):
         return None
@@ -54,10 +54,10 @@ def _stalls(time_ns: IntArray, count: IntArray) -> bool:
     """
     between = np.diff(time_ns)
     usual, size = float(np.median(between)), float(np.median(count))
-    large = count > LARGEST_BATCH * size
-    crowded = between / usual < count[1:] / size / LARGEST_BATCH
+    large = count > MAX_BATCH_RATIO * size
+    crowded = between / usual < count[1:] / size / MAX_BATCH_RATIO
     # How long the first took to fill is not known: a recorder may begin with a full buffer.
-    first = large[0] and count[0] > MOST_TWICE * np.sum(count)
+    first = large[0] and count[0] > MAX_DUPLICATED * np.sum(count)
     return bool(first or np.any(crowded & large[1:]))
 
 

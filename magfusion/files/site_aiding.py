@@ -8,8 +8,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from magfusion.files.site_magnetometer import MountingEntry
 from magfusion.files.site_plain import degree_sigma_entry, plain, rotation_of, rpy_deg, sigma_entry
 from magfusion.files.site_values import (
-    LARGEST_ANGLE,
-    LARGEST_DISTANCE,
+    MAX_ANGLE,
+    MAX_DISTANCE,
     AboveZero,
     Angles,
     FromZero,
@@ -37,9 +37,9 @@ UNITS: dict[Quantity, str] = {
 }
 _MOVING: tuple[Quantity, ...] = ("velocity", "relative_pose")  # with scale and mounting
 DENSEST = 2e4  # kg/m^3; mercury has 13,600
-LARGEST_HEIGHT = 1e5  # m; the space begins there
+MAX_HEIGHT = 1e5  # m; the space begins there
 HIGHEST_PRESSURE = 1e9  # Pa; ten times that of the deepest sea
-_Distance = Annotated[float, between(-LARGEST_DISTANCE, LARGEST_DISTANCE)]
+_Distance = Annotated[float, between(-MAX_DISTANCE, MAX_DISTANCE)]
 _Share = Annotated[FromZero, between(0.0, 1.0)]
 
 
@@ -133,7 +133,7 @@ class OriginEntry(StrictModel):
 
     latitude_deg: Annotated[float, between(-90.0, 90.0)]
     longitude_deg: Annotated[float, between(-180.0, 360.0)]
-    height_m: Annotated[float, between(-LARGEST_HEIGHT, LARGEST_HEIGHT)]
+    height_m: Annotated[float, between(-MAX_HEIGHT, MAX_HEIGHT)]
 
 
 class FrameEntry(StrictModel):
@@ -188,7 +188,7 @@ class HeadingEntry(_Sensor):
 
     quantity: Literal["heading"]
     noise_deg: AboveZero
-    offset_deg: Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)] = 0.0
+    offset_deg: Annotated[float, between(-MAX_ANGLE, MAX_ANGLE)] = 0.0
     offset_walk_deg: NotNegative = 0.0  # gained in an hour
     sigma: _HeadingSigma = Field(default_factory=_HeadingSigma)
 

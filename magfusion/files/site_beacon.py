@@ -17,11 +17,11 @@ from magfusion.files.site_rotor import RotorEntry
 from magfusion.files.site_temperature import MomentTemperatureEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
-    LARGEST_ANGLE,
-    LARGEST_DISTANCE,
-    LARGEST_MOMENT,
     LOWEST_FREQUENCY,
-    SMALLEST_MOMENT,
+    MAX_ANGLE,
+    MAX_DISTANCE,
+    MAX_MOMENT,
+    MIN_MOMENT,
     AboveZero,
     Position,
     PositionSigma,
@@ -47,7 +47,7 @@ from magfusion.units import DEGREE, Array
 _Length = Annotated[AboveZero, between(1e-5, 1e3)]
 _Count = Annotated[int, Field(ge=1, le=100_000)]
 _Frequency = Annotated[AboveZero, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
-_Angle = Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)]
+_Angle = Annotated[float, between(-MAX_ANGLE, MAX_ANGLE)]
 
 
 class WindingEntry(StrictModel):
@@ -100,10 +100,10 @@ class CoilEntry(StrictModel):
                 remedy = "remove it or winding, of which it follows"
                 raise refusal_at((key,), np.asarray(getattr(self, key)).tolist(), remedy)
         moment = self.winding.coil().moment
-        if not SMALLEST_MOMENT <= moment <= LARGEST_MOMENT:
+        if not MIN_MOMENT <= moment <= MAX_MOMENT:
             remedy = (
-                f"these turns have {moment:.3g} A m^2, and a beacon from {SMALLEST_MOMENT:g} to"
-                f" {LARGEST_MOMENT:g}; give current and lengths in A and m"
+                f"these turns have {moment:.3g} A m^2, and a beacon from {MIN_MOMENT:g} to"
+                f" {MAX_MOMENT:g}; give current and lengths in A and m"
             )
             raise refusal_at(("winding",), self.winding.model_dump(), remedy)
         return self
@@ -130,14 +130,14 @@ class CoilEntry(StrictModel):
 
 
 MARKED = "marked"
-MOST_SLOTS = 1000
+MAX_SLOTS = 1000
 
 
 class SlotsEntry(StrictModel):
     """When the coils of a beacon are driven, one after the other."""
 
     duration_s: Annotated[AboveZero, between(1e-4, 3600.0)]
-    count: Annotated[int, Field(ge=1, le=MOST_SLOTS)]
+    count: Annotated[int, Field(ge=1, le=MAX_SLOTS)]
     start_s: Annotated[float, between(-1e10, 1e10)] = 0.0
 
 
@@ -172,8 +172,8 @@ class BeaconEntry(StrictModel):
     """One beacon with its coils."""
 
     name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)]
-    position_m: Annotated[Array | None, array(3, largest=LARGEST_DISTANCE, unit="m")] = None
-    rpy_deg: Annotated[Array | None, array(3, largest=LARGEST_ANGLE, unit="degrees")] = None
+    position_m: Annotated[Array | None, array(3, largest=MAX_DISTANCE, unit="m")] = None
+    rpy_deg: Annotated[Array | None, array(3, largest=MAX_ANGLE, unit="degrees")] = None
     unknown: Literal["pose", "position", "attitude"] | None = None
     slots: Annotated[SlotsEntry | Literal["marked"], PlainValidator(_slots)] | None = None
     frequency_hz: Annotated[float, AfterValidator(_direct_current_only_in_slots)]
@@ -244,7 +244,7 @@ class BeaconEntry(StrictModel):
     def _coils_are_marked(self) -> Self:
         """See that marks name every coil, and that they leave the sign of pulses no doubt."""
         for i, coil in enumerate(self.coils or []):
-            if coil.slot is None or coil.slot >= MOST_SLOTS:
+            if coil.slot is None or coil.slot >= MAX_SLOTS:
                 raise refusal_at(("coils", i, "slot"), coil.slot, "give the number in the marks")
             if not self.synchronised and not (coil.frequency_hz or self.frequency_hz):
                 remedy = "write true: marks give the times of a pulse, and its sign is its coil's"

@@ -32,9 +32,9 @@ from magfusion.files.site_response import (
 )
 from magfusion.files.site_temperature import SensorTemperatureEntry, temperature_entry
 from magfusion.files.site_values import (
-    LARGEST_NOISE_DENSITY,
-    LARGEST_OFFSET,
-    LARGEST_SCALE,
+    MAX_NOISE_DENSITY,
+    MAX_OFFSET,
+    MAX_SCALE,
     AboveZero,
     Angles,
     FromZero,
@@ -57,7 +57,7 @@ from magfusion.model.site import Magnetometer, MagnetometerSigma, Platform
 from magfusion.units import Array
 
 RESPONSE_KEYS = ("response", "axis_responses", "coil", "axis_coils")
-LARGEST_PHASE = 0.2  # rad; of a tone by a clock's sigma: three of them are still nearly linear
+MAX_PHASE = 0.2  # rad; of a tone by a clock's sigma: three of them are still nearly linear
 
 
 class MagnetometerSigmaEntry(StrictModel):
@@ -66,7 +66,7 @@ class MagnetometerSigmaEntry(StrictModel):
     matrix: Annotated[Array, sigma_array(3, 3, largest=10.0)] = Field(
         default_factory=lambda: np.zeros((3, 3))
     )
-    offset_t: Annotated[Array, sigma_array(3, largest=1e9), tesla(LARGEST_OFFSET)] = Field(
+    offset_t: Annotated[Array, sigma_array(3, largest=1e9), tesla(MAX_OFFSET)] = Field(
         default_factory=zeros
     )
     rotation_deg: RotationSigma = Field(default_factory=zeros)
@@ -86,15 +86,15 @@ class MagnetometerEntry(StrictModel):
 
     body_from_sensor: MountingEntry = Field(default_factory=MountingEntry)
     noise_density_t_rthz: Annotated[
-        AboveZero, tesla(LARGEST_NOISE_DENSITY, "T/sqrt(Hz)"), between(1e-18, LARGEST_NOISE_DENSITY)
+        AboveZero, tesla(MAX_NOISE_DENSITY, "T/sqrt(Hz)"), between(1e-18, MAX_NOISE_DENSITY)
     ]
-    matrix: Annotated[Array, array(3, 3, largest=LARGEST_SCALE), AfterValidator(not_singular)] = (
-        Field(default_factory=lambda: np.eye(3))
+    matrix: Annotated[Array, array(3, 3, largest=MAX_SCALE), AfterValidator(not_singular)] = Field(
+        default_factory=lambda: np.eye(3)
     )
-    offset_t: Annotated[Array, array(3), tesla(LARGEST_OFFSET)] = Field(default_factory=zeros)
+    offset_t: Annotated[Array, array(3), tesla(MAX_OFFSET)] = Field(default_factory=zeros)
     coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
     coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
-    offset_walk_t: Annotated[NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
+    offset_walk_t: Annotated[NotNegative, tesla(MAX_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorTemperatureEntry | None = None
     response: Listed | None = None
     response_sigma: Annotated[list[ResponseSigmaEntry], at_least_one("frequency")] | None = None
@@ -171,10 +171,10 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     if sensor.response_sigma is not None:
         check_response_sigma(sensor.response_sigma, tones_hz, (*at, "response_sigma"))
     highest = float(np.max(tones_hz, initial=0.0))
-    if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
-        maximum = LARGEST_PHASE / (2.0 * np.pi * highest)
+    if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > MAX_PHASE:
+        maximum = MAX_PHASE / (2.0 * np.pi * highest)
         remedy = (
-            f"give at most {maximum:.2g} s, {LARGEST_PHASE:g} rad of the tone at {highest:g} Hz:"
+            f"give at most {maximum:.2g} s, {MAX_PHASE:g} rad of the tone at {highest:g} Hz:"
             " beyond it the phases of magnetometers cannot be compared; record all by one clock"
         )
         raise refusal_at((*at, "sigma", "clock_offset_s"), sensor.sigma.clock_offset_s, remedy)

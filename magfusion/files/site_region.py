@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
-from magfusion.files.site_values import LARGEST_DISTANCE, a_direction, array, refusal, refusal_at
+from magfusion.files.site_values import MAX_DISTANCE, a_direction, array, refusal, refusal_at
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.region import HalfSpace, Region
 from magfusion.units import Array
@@ -16,7 +16,7 @@ class HalfSpaceEntry(StrictModel):
     """`magfusion.model.region.HalfSpace`."""
 
     normal: Annotated[Array, array(3), AfterValidator(a_direction)]
-    through_m: Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")] = Field(
+    through_m: Annotated[Array, array(3, largest=MAX_DISTANCE, unit="m")] = Field(
         default_factory=lambda: np.zeros(3)
     )
 
@@ -41,7 +41,7 @@ def _is_number(value: object) -> bool:
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
-        and (math.isinf(value) or abs(value) <= LARGEST_DISTANCE)
+        and (math.isinf(value) or abs(value) <= MAX_DISTANCE)
     )
 
 

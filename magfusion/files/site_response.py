@@ -9,8 +9,8 @@ from pydantic import Field
 from magfusion.files.site_plain import degree_sigma_entry, sigma_entry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
-    LARGEST_ANGLE,
     LOWEST_FREQUENCY,
+    MAX_ANGLE,
     AboveZero,
     at_least_one,
     between,
@@ -27,7 +27,7 @@ class ResponseEntry(StrictModel):
 
     frequency_hz: Annotated[float, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
     gain: Annotated[float, Field(gt=0.0), between(1e-6, 1e6)]
-    phase_deg: Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)] = 0.0
+    phase_deg: Annotated[float, between(-MAX_ANGLE, MAX_ANGLE)] = 0.0
 
 
 Listed = Annotated[list[ResponseEntry], at_least_one("frequency")]

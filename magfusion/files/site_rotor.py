@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from magfusion.files.site_values import (
-    LARGEST_ANGLE,
-    LARGEST_MOMENT,
-    SMALLEST_MOMENT,
+    MAX_ANGLE,
+    MAX_MOMENT,
+    MIN_MOMENT,
     a_direction,
     a_moment,
     array,
@@ -28,13 +28,13 @@ class HarmonicEntry(StrictModel):
 
     order: Annotated[int, Field(ge=2, le=50)]
     moment_a_m2: Annotated[Array, array(3), AfterValidator(a_moment)]
-    phase_deg: Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)] = 0.0
+    phase_deg: Annotated[float, between(-MAX_ANGLE, MAX_ANGLE)] = 0.0
 
 
 class RotorEntry(StrictModel):
     """`magfusion.model.rotor.Rotor`."""
 
-    moment_a_m2: Annotated[float, between(SMALLEST_MOMENT, LARGEST_MOMENT)]
+    moment_a_m2: Annotated[float, between(MIN_MOMENT, MAX_MOMENT)]
     axis: Annotated[Array, array(3), AfterValidator(a_direction)] = Field(
         default_factory=lambda: np.array([1.0, 0.0, 0.0])
     )

@@ -11,8 +11,8 @@ from magfusion.files.site_magnetometer import MagnetometerEntry, check_magnetome
 from magfusion.files.site_motion import ImuEntry, ImuIntrinsicsEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_values import (
-    LARGEST_CONDUCTIVITY,
-    LARGEST_EARTH_FIELD,
+    MAX_CONDUCTIVITY,
+    MAX_EARTH_FIELD,
     AboveZero,
     FromZero,
     NotNegative,
@@ -60,13 +60,13 @@ class EarthEntry(StrictModel):
     declination_sigma_deg: Positive = _EARTH.declination_sigma / DEGREE
     strength_sigma: Positive = _EARTH.strength_sigma
     declination_walk_deg: NotNegative = _EARTH.declination_walk / DEGREE
-    strength_walk_t: Annotated[NotNegative, tesla(LARGEST_EARTH_FIELD)] = _EARTH.strength_walk
+    strength_walk_t: Annotated[NotNegative, tesla(MAX_EARTH_FIELD)] = _EARTH.strength_walk
 
 
 class WorldSigmaEntry(StrictModel):
     """Priors of the world's calibration; an absent one is zero, which means known."""
 
-    conductivity_s_m: Annotated[FromZero, between(0.0, LARGEST_CONDUCTIVITY)] = 0.0
+    conductivity_s_m: Annotated[FromZero, between(0.0, MAX_CONDUCTIVITY)] = 0.0
 
 
 class WorldEntry(StrictModel):
@@ -77,7 +77,7 @@ class WorldEntry(StrictModel):
     model_error_correlation_m: NotNegative = Site.model_error_length
     field_map: Annotated[str, Field(min_length=1)] | None = None
     steel: Annotated[str, Field(min_length=1)] | None = None
-    earth_field_t: Annotated[Array, array(3), tesla(LARGEST_EARTH_FIELD)] | None = None
+    earth_field_t: Annotated[Array, array(3), tesla(MAX_EARTH_FIELD)] | None = None
     location: LocationEntry | None = None
     earth: EarthEntry = EarthEntry()
     conductivity_s_m: Annotated[FromZero, AfterValidator(a_conductivity)] = 0.0

@@ -11,8 +11,8 @@ from magfusion.model.temperature import MomentTemperatureModel, SensorTemperatur
 from magfusion.units import Array
 
 COLDEST, HOTTEST = -273.15, 1000.0  # degrees Celsius
-LARGEST_SHARE = 0.1  # of a moment, or of a matrix, in one kelvin
-LARGEST_OFFSET = 1e-4  # T/K
+MAX_SHARE = 0.1  # of a moment, or of a matrix, in one kelvin
+MAX_OFFSET = 1e-4  # T/K
 
 _Celsius = Annotated[float, between(COLDEST, HOTTEST)]
 
@@ -20,7 +20,7 @@ _Celsius = Annotated[float, between(COLDEST, HOTTEST)]
 class MomentTemperatureEntry(StrictModel):
     """`magfusion.model.temperature.MomentTemperatureModel`."""
 
-    log_moment_per_k: Annotated[float, between(-LARGEST_SHARE, LARGEST_SHARE)]
+    log_moment_per_k: Annotated[float, between(-MAX_SHARE, MAX_SHARE)]
     reference_degc: _Celsius = MomentTemperatureModel.reference_degc
 
     def temperature_model(self) -> MomentTemperatureModel:
@@ -31,10 +31,10 @@ class MomentTemperatureEntry(StrictModel):
 class SensorTemperatureEntry(StrictModel):
     """`magfusion.model.temperature.SensorTemperatureModel`."""
 
-    matrix_per_k: Annotated[Array, array(3, 3, largest=LARGEST_SHARE)] = Field(
+    matrix_per_k: Annotated[Array, array(3, 3, largest=MAX_SHARE)] = Field(
         default_factory=lambda: np.zeros((3, 3))
     )
-    offset_t_per_k: Annotated[Array, array(3), tesla(LARGEST_OFFSET, "T/K")] = Field(
+    offset_t_per_k: Annotated[Array, array(3), tesla(MAX_OFFSET, "T/K")] = Field(
         default_factory=lambda: np.zeros(3)
     )
     reference_degc: _Celsius = SensorTemperatureModel.reference_degc

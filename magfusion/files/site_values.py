@@ -12,20 +12,20 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from magfusion.units import Array
 
 # What no installation reaches and any value written in nT by mistake exceeds.
-LARGEST_EARTH_FIELD = 1e-3  # T
-LARGEST_OFFSET = 1e-2  # T
-LARGEST_NOISE_DENSITY = 1e-4  # T/sqrt(Hz)
+MAX_EARTH_FIELD = 1e-3  # T
+MAX_OFFSET = 1e-2  # T
+MAX_NOISE_DENSITY = 1e-4  # T/sqrt(Hz)
 
-LARGEST_DISTANCE = 1e6  # m
-LARGEST_ANGLE = 1e4  # degrees; a few turns do no harm
+MAX_DISTANCE = 1e6  # m
+MAX_ANGLE = 1e4  # degrees; a few turns do no harm
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e-2, 1e6  # Hz
-LARGEST_MOMENT, SMALLEST_MOMENT = 1e9, 1e-9  # A m^2
-LARGEST_CONDUCTIVITY, SMALLEST_CONDUCTIVITY = 1e3, 1e-9  # S/m; the sea has 5, dry rock 1e-6
-LARGEST_LOG_MOMENT = 10.0  # a factor of 22,000
+MAX_MOMENT, MIN_MOMENT = 1e9, 1e-9  # A m^2
+MAX_CONDUCTIVITY, MIN_CONDUCTIVITY = 1e3, 1e-9  # S/m; the sea has 5, dry rock 1e-6
+MAX_LOG_MOMENT = 10.0  # a factor of 22,000
 FORMULA = ("=", "+", "-", "@")  # how a spreadsheet's formula begins
-LEAST_SIGMA = 1e-15  # in any unit; what is known better is known, which is zero
-SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3  # of a magnetometer matrix
-LARGEST_CONDITION = 1e6  # of a magnetometer matrix that can be undone to any use
+MIN_SIGMA = 1e-15  # in any unit; what is known better is known, which is zero
+MIN_SCALE, MAX_SCALE = 1e-3, 1e3  # of a magnetometer matrix
+MAX_CONDITION = 1e6  # of a magnetometer matrix that can be undone to any use
 
 
 def refusal(remedy: str) -> PydanticCustomError:
@@ -77,14 +77,14 @@ def sigma_array(*shape: int, largest: float) -> PlainValidator:
 def coil_sigma(value: object) -> Array:
     """Read one standard deviation for all coils, or one a coil."""
     coils = len(value) if isinstance(value, list) else 1
-    return _spread(value, (coils,), "a list of one per coil", LARGEST_LOG_MOMENT)
+    return _spread(value, (coils,), "a list of one per coil", MAX_LOG_MOMENT)
 
 
 def _spread(value: object, shape: tuple[int, ...], lists: str, largest: float) -> Array:
     if _fits(value, ()) or _fits(value, shape):
         array = np.array(value, dtype=float)
         known = array == 0.0
-        if np.all(known | ((array >= LEAST_SIGMA) & (array <= largest))):
+        if np.all(known | ((array >= MIN_SIGMA) & (array <= largest))):
             return array
     raise refusal(
         f"give one number or {lists}, finite and not negative, at most {largest:g}; 0 for what is"
@@ -94,10 +94,8 @@ def _spread(value: object, shape: tuple[int, ...], lists: str, largest: float) -
 
 def a_conductivity(value: float) -> float:
     """Refuse a conductivity that neither ground nor water has."""
-    if value != 0.0 and not SMALLEST_CONDUCTIVITY <= value <= LARGEST_CONDUCTIVITY:
-        raise refusal(
-            f"give it in S/m, from {SMALLEST_CONDUCTIVITY:g} to {LARGEST_CONDUCTIVITY:g}, or 0"
-        )
+    if value != 0.0 and not MIN_CONDUCTIVITY <= value <= MAX_CONDUCTIVITY:
+        raise refusal(f"give it in S/m, from {MIN_CONDUCTIVITY:g} to {MAX_CONDUCTIVITY:g}, or 0")
     return value
 
 
@@ -105,10 +103,8 @@ def a_moment(value: Array) -> Array:
     """Refuse a moment that no coil has."""
     if not value.any():
         raise refusal("give the peak moment in A m^2, not zero; remove a coil that is not driven")
-    if not SMALLEST_MOMENT <= math.hypot(*value) <= LARGEST_MOMENT:
-        raise refusal(
-            f"give the peak moment in A m^2, from {SMALLEST_MOMENT:g} to {LARGEST_MOMENT:g}"
-        )
+    if not MIN_MOMENT <= math.hypot(*value) <= MAX_MOMENT:
+        raise refusal(f"give the peak moment in A m^2, from {MIN_MOMENT:g} to {MAX_MOMENT:g}")
     return value
 
 
@@ -121,9 +117,9 @@ def a_direction(value: Array) -> Array:
 
 def not_singular(value: Array) -> Array:
     """Refuse a matrix that cannot be undone."""
-    if not np.linalg.cond(value) <= LARGEST_CONDITION:
+    if not np.linalg.cond(value) <= MAX_CONDITION:
         raise refusal("give a matrix that can be inverted")
-    if not np.linalg.norm(value, 2) >= SMALLEST_SCALE:
+    if not np.linalg.norm(value, 2) >= MIN_SCALE:
         raise refusal("give a matrix of tesla by tesla, near the identity")
     return value
 
@@ -195,7 +191,7 @@ FromZero = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[AboveZero, between(1e-12, 1e6)]
 NotNegative = Annotated[FromZero, between(0.0, 1e6)]
-Position = Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")]
-Angles = Annotated[Array, array(3, largest=LARGEST_ANGLE, unit="degrees")]
+Position = Annotated[Array, array(3, largest=MAX_DISTANCE, unit="m")]
+Angles = Annotated[Array, array(3, largest=MAX_ANGLE, unit="degrees")]
 PositionSigma = Annotated[Array, sigma_array(3, largest=1e4)]
 RotationSigma = Annotated[Array, sigma_array(3, largest=360.0)]

@@ -7,11 +7,13 @@ import numpy as np
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NANOSECOND, BoolArray, IntArray
 
-LONGEST_GAP = 3600.0  # s; of a clock that did not jump
+MAX_GAP = 3600.0  # s; of a clock that did not jump
 # Share and number of rows that are left out as false; more are a part of the recording.
-MOST_STRAY, MOST_STRAY_ROWS = 0.01, 100
+MAX_STRAY_SHARE, MAX_STRAY_ROWS = 0.01, 100
 MIN_ROWS = 10  # from which the step of a stream is known
-MOST_APART = 3.0  # steps between the rows around a stray one: its own place, and a lost row
+MAX_SEPARATION_STEPS = (
+    3.0  # steps between the rows around a stray one: its own place, and a lost row
+)
 FAR = 10.0  # steps; a stamp that is less away may be one of jitter, or of a late message
 # s, steps; a first or last row that is more away: else it may be one before or after a pause
 EDGE_S, EDGE = 1.0, 20.0
@@ -22,8 +24,8 @@ def stray_rows(
     time_ns: IntArray,
     before: int = 0,
     last_ns: int | None = None,
-    accepted_share: float = MOST_STRAY,
-    accepted_rows: int = MOST_STRAY_ROWS,
+    accepted_share: float = MAX_STRAY_SHARE,
+    accepted_rows: int = MAX_STRAY_ROWS,
 ) -> BoolArray:
     """Return which rows have a stamp that is more than an hour from those of the others.
 
@@ -46,14 +48,14 @@ def stray_rows(
     seconds = time_ns * NANOSECOND  # as doubles: differences may be beyond int64
     last = seconds[:1] if last_ns is None else np.array([last_ns * NANOSECOND])
     stray = np.zeros(len(time_ns), dtype=bool)
-    if not (np.abs(np.diff(seconds, prepend=last)) > LONGEST_GAP).any():
+    if not (np.abs(np.diff(seconds, prepend=last)) > MAX_GAP).any():
         return stray
     order = np.argsort(seconds, kind="stable")
-    group = np.cumsum(np.diff(seconds[order], prepend=seconds[order[0]]) > LONGEST_GAP)
+    group = np.cumsum(np.diff(seconds[order], prepend=seconds[order[0]]) > MAX_GAP)
     count = np.bincount(group)
     few = count < count.max()
     if last_ns is not None:
-        near = np.abs(seconds[order] - last) <= LONGEST_GAP
+        near = np.abs(seconds[order] - last) <= MAX_GAP
         few = ~np.isin(np.arange(len(count)), group[near])
     accepted = min(max(1.0, accepted_share * (len(time_ns) + before)), accepted_rows)
     if np.sum(count[few]) <= accepted:
@@ -62,7 +64,7 @@ def stray_rows(
 
 
 def all_strays(
-    time_ns: IntArray, accepted_share: float = MOST_STRAY, accepted_rows: int = MOST_STRAY_ROWS
+    time_ns: IntArray, accepted_share: float = MAX_STRAY_SHARE, accepted_rows: int = MAX_STRAY_ROWS
 ) -> BoolArray:
     """Return which rows of a whole stream are stray, by `stray_rows` or `misplaced_rows`.
 
@@ -84,7 +86,7 @@ def counted_back(time_ns: IntArray, count: int) -> int:
 
 
 def misplaced_rows(
-    time_ns: IntArray, accepted_share: float = MOST_STRAY, accepted_rows: int = MOST_STRAY_ROWS
+    time_ns: IntArray, accepted_share: float = MAX_STRAY_SHARE, accepted_rows: int = MAX_STRAY_ROWS
 ) -> BoolArray:
     """Return which single rows have a stamp that is neither of their place nor of another.
 
@@ -117,7 +119,7 @@ def misplaced_rows(
     limit[[0, -1]] = max(EDGE_S, EDGE * step)
     gap = after - before
     away = np.maximum(before - seconds, seconds - after) > limit
-    candidate = away & (gap >= 0.0) & (gap <= MOST_APART * step)
+    candidate = away & (gap >= 0.0) & (gap <= MAX_SEPARATION_STEPS * step)
     others = np.concatenate([[-np.inf], np.sort(seconds[~candidate]), [np.inf]])
     place = np.searchsorted(others, seconds[candidate])
     below, above = seconds[candidate] - others[place - 1], others[place] - seconds[candidate]

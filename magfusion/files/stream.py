@@ -15,9 +15,9 @@ from magfusion.files.yaml_files import sentence
 
 Format = Literal["json", "msgpack"]
 _CHUNK = 1 << 16  # bytes
-LARGEST_RECORD = 1 << 24  # bytes; minutes of samples
+MAX_RECORD = 1 << 24  # bytes; minutes of samples
 # MessagePack reserves what a list announces before it reads it.
-LONGEST_LIST = 1 << 17
+MAX_LIST = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ def read_records(stream: BinaryIO, form: Format) -> Iterator[NumberedRecord]:
 
 def _json_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
     number = 0
-    while line := stream.readline(LARGEST_RECORD + 1):
+    while line := stream.readline(MAX_RECORD + 1):
         number += 1
-        if len(line) > LARGEST_RECORD:
+        if len(line) > MAX_RECORD:
             while line and not line.endswith(b"\n"):
                 line = stream.readline(_CHUNK)
             yield NumberedRecord(number, None, _TOO_LARGE)
@@ -59,17 +59,17 @@ def _json_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
             yield checked_record(number, partial(Record.model_validate_json, line))
 
 
-_TOO_LARGE = f"is larger than {LARGEST_RECORD >> 20} MiB; write fewer samples in a record."
+_TOO_LARGE = f"is larger than {MAX_RECORD >> 20} MiB; write fewer samples in a record."
 
 
 def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
     number, fed, whole = 0, 0, 0  # records; bytes received, and those of whole records
     unpacker = msgpack.Unpacker(
-        max_buffer_size=LARGEST_RECORD + _CHUNK,
-        max_str_len=LARGEST_RECORD,
-        max_bin_len=LARGEST_RECORD,
-        max_array_len=LONGEST_LIST,
-        max_map_len=LONGEST_LIST,
+        max_buffer_size=MAX_RECORD + _CHUNK,
+        max_str_len=MAX_RECORD,
+        max_bin_len=MAX_RECORD,
+        max_array_len=MAX_LIST,
+        max_map_len=MAX_LIST,
     )
     # As much as has come: read() would wait for all of a chunk.
     while chunk := stream.read1(_CHUNK):  # type: ignore[attr-defined]

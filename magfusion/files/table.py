@@ -15,17 +15,17 @@ import pyarrow.parquet
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.clock_steps import clock_set_back
-from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
+from magfusion.files.parquet_bounds import MAX_BYTES, MAX_ROWS, read_batches, refuse_unfolding
 from magfusion.files.plain_table import refuse_damaged_text
-from magfusion.files.stray_stamps import LONGEST_GAP, all_strays
+from magfusion.files.stray_stamps import MAX_GAP, all_strays
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
 # Larger than any clock's reading, and far enough from the ends of int64 to subtract.
-LARGEST_TIME_NS = 1 << 62
+MAX_TIME_NS = 1 << 62
 TWICE = "the time of the row above: remove one of the two"  # of a refused row
-LARGEST_NUMBER = 1e100  # whose square is still finite
+MAX_NUMBER = 1e100  # whose square is still finite
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Span:
     @property
     def bounds_ns(self) -> tuple[int, int]:
         """First time within and first time beyond, as stamps."""
-        return self._stamp(self.start, -LARGEST_TIME_NS), self._stamp(self.end, LARGEST_TIME_NS)
+        return self._stamp(self.start, -MAX_TIME_NS), self._stamp(self.end, MAX_TIME_NS)
 
     def seconds(self, time_ns: IntArray) -> Array:
         """Return stamps as seconds since the epoch."""
@@ -67,9 +67,9 @@ class Span:
     def _stamp(self, time: float | None, default: int) -> int:
         if time is None:
             return default
-        maximum = LARGEST_TIME_NS * NANOSECOND
+        maximum = MAX_TIME_NS * NANOSECOND
         stamp = self.epoch_ns + round(max(-maximum, min(time, maximum)) / NANOSECOND)
-        return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
+        return max(-MAX_TIME_NS, min(stamp, MAX_TIME_NS))
 
 
 class TableLayout(NamedTuple):
@@ -149,7 +149,7 @@ class Table:
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()
-            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)
+            bad = ~(np.abs(values[:, k]) < MAX_NUMBER)
             if nan:
                 values[bad, k] = np.nan
             else:
@@ -251,7 +251,7 @@ def refuse_jump(table: Table, before: int | None) -> None:
     `before`: time of the row above the first (ns).
     """
     first = table.time_ns[:1] if before is None else before
-    jumped = np.diff(table.time_ns, prepend=first) * NANOSECOND > LONGEST_GAP
+    jumped = np.diff(table.time_ns, prepend=first) * NANOSECOND > MAX_GAP
     remedy = (
         "more than an hour after the row above: the clock jumped; correct the times, or use one"
         " side by --start and --end"
@@ -284,7 +284,7 @@ def _read_parquet(path: Path, layout: TableLayout, span: Span) -> tuple[pa.Table
         skipped = sum(file.metadata.row_group(g).num_rows for g in range(groups[0]))
         refuse_unfolding(file, names, own, path)
         count = sum(group.num_rows for group in own)
-        if count <= MOST_ROWS:
+        if count <= MAX_ROWS:
             many = count > ROWS_PER_GROUP  # fewer are read sooner than threads are woken
             return file.read_row_groups(list(groups), columns=names, use_threads=many), skipped
         return read_batches(file, names, groups, span.bounds_ns, path, skipped)
@@ -303,9 +303,9 @@ def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
 
 
 def _read_csv(path: Path, layout: TableLayout) -> pa.Table:
-    if path.stat().st_size > MOST_BYTES:
+    if path.stat().st_size > MAX_BYTES:
         raise InputError(
-            f"{path}: is larger than {MOST_BYTES >> 20} MiB; write it as Parquet, of which a part"
+            f"{path}: is larger than {MAX_BYTES >> 20} MiB; write it as Parquet, of which a part"
             " can be read."
         )
     with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -325,7 +325,7 @@ def _read_csv(path: Path, layout: TableLayout) -> pa.Table:
 
 def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span) -> None:
     """Refuse times that are no nanoseconds, or not sorted."""
-    far = np.abs(time_ns) > LARGEST_TIME_NS
+    far = np.abs(time_ns) > MAX_TIME_NS
     whole.refuse(far, TIME, time_ns, "write nanoseconds")
     step = np.diff(time_ns, prepend=time_ns[:1] - 1)
     back = clock_set_back(time_ns, np.arange(float(len(time_ns)))[:, None])

@@ -13,14 +13,14 @@ from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.lost_rows import copied_rows, copies_findings, copies_text
 from magfusion.files.pose_rows import PoseRows
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
+from magfusion.files.table import MAX_NUMBER, MAX_TIME_NS, Span
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NS_PER_S
 
 # Exponents of ten of a second; a stamp beyond the year 2100 in seconds is in a smaller unit.
 TIME_UNITS = {"s": 0, "ms": -3, "us": -6, "ns": -9}
-_LATEST_S = 4.1e9
+_MAX_UNIX_S = 4.1e9
 _COLUMNS = "time_s x y z qx qy qz qw"
 _POSITIONS = "time_s x y z"
 _EIGHT = f"eight numbers: {_COLUMNS}"
@@ -84,7 +84,7 @@ def read_tum(path: Path, epoch_ns: int = 0, findings: list[Finding] | None = Non
 
 def tum_time_unit(largest: float) -> str:
     """Return the unit in which the largest stamp of a file is no date beyond 2100; else s."""
-    fitting = [name for name, power in TIME_UNITS.items() if largest * 10.0**power < _LATEST_S]
+    fitting = [name for name, power in TIME_UNITS.items() if largest * 10.0**power < _MAX_UNIX_S]
     return fitting[0] if fitting else "s"
 
 
@@ -108,18 +108,18 @@ def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not abs(values[0]) < LARGEST_NUMBER:
+    if len(values) != count or not abs(values[0]) < MAX_NUMBER:
         wanted = f"four numbers: {_POSITIONS}" if count == 4 else _EIGHT
         _refuse(path, number, repr(text[:60]), wanted)
-    return [value if abs(value) < LARGEST_NUMBER else np.nan for value in values]
+    return [value if abs(value) < MAX_NUMBER else np.nan for value in values]
 
 
 def _stamp(path: Path, number: int, text: str, unit: str) -> int:
     try:
         stamp = round(Decimal(text.split()[0]).scaleb(TIME_UNITS[unit]) * NS_PER_S)
     except InvalidOperation:
-        stamp = LARGEST_TIME_NS + 1
-    if abs(stamp) > LARGEST_TIME_NS:
+        stamp = MAX_TIME_NS + 1
+    if abs(stamp) > MAX_TIME_NS:
         _refuse(path, number, f"time {text.split()[0]}", "seconds")
     return stamp
 

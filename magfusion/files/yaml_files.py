@@ -12,7 +12,7 @@ from pydantic_core.core_schema import ErrorType
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 
-LARGEST_YAML = 1 << 20  # bytes
+MAX_YAML = 1 << 20  # bytes
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -101,7 +101,7 @@ def _text(path: Path) -> str:
         raise InputError(f"{path}: {result}; give the path of a YAML file.")
     try:
         with path.open("rb") as stream:
-            content = stream.read(LARGEST_YAML + 1)
+            content = stream.read(MAX_YAML + 1)
         text = content.decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); allow it.") from error
@@ -109,9 +109,9 @@ def _text(path: Path) -> str:
         raise InputError(
             f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8 text."
         ) from error
-    if len(content) > LARGEST_YAML:
+    if len(content) > MAX_YAML:
         raise InputError(
-            f"{path}: is larger than {LARGEST_YAML} bytes; give a YAML file written for magfusion."
+            f"{path}: is larger than {MAX_YAML} bytes; give a YAML file written for magfusion."
         )
     return text
 

@@ -24,7 +24,7 @@ from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 STREAM_TESTS = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
 # Stamps contain little noise if evenly sampled; missing samples are tracked.
 TOLERATED_CODES = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
-MOST_LOST = 0.05  # share of the samples, from which it matters after all
+MAX_LOST = 0.05  # share of the samples, from which it matters after all
 MOVED = 0.2  # share of the time, from which it was no rest
 GRAVITY_UNSURE = 0.03  # m/s^2, of the standard one, without a site
 DENSITY = np.sqrt(2.0)  # one-sided density over what an Allan deviation shows
@@ -32,7 +32,7 @@ HALF = 0.5
 # Signature of steps larger than the noise.
 OF_STEPS = frozenset({"false_samples", "imu_spikes", "repeated_samples", "frozen_imu"})
 OF_CONSTANTS = frozenset({"stuck_axis", "frozen_imu", "frozen_magnetometer"})
-LEAST_SAMPLES = 200
+MIN_SAMPLES = 200
 AXES = "xyz"
 
 
@@ -108,7 +108,7 @@ class _StreamFindings:
             verdict = finding.verdict
             if verdict is Verdict.FAILED and count <= HALF * self.pieces:
                 verdict = Verdict.DOUBTFUL
-            if finding.code in TOLERATED_CODES and missing_share < MOST_LOST:
+            if finding.code in TOLERATED_CODES and missing_share < MAX_LOST:
                 verdict = Verdict.TRUSTWORTHY
             where = ""
             if self.pieces > 1:
@@ -172,7 +172,7 @@ def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _StreamFin
         rows, present = rows + len(piece.time), present + np.isfinite(piece.values).sum(axis=0)
         rest.add(piece.time, piece.values)
         findings.add(_of_piece(stream, piece))
-    if findings.pieces and len(rest) < LEAST_SAMPLES:
+    if findings.pieces and len(rest) < MIN_SAMPLES:
         names = [STREAMS[stream].numbers[k] for k in np.flatnonzero(present == 0)]
         if names:
             raise InputError(

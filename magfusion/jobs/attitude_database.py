@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 TABLE = "attitudes.parquet"
-LEAST_FIELD = 1e-7  # T; a two hundredth of the Earth's at its weakest
+MIN_FIELD = 1e-7  # T; a two hundredth of the Earth's at its weakest
 DISTORTED, CONTRADICTED = 0.15, 0.3  # of the field: doubt, and more than iron on a platform does
 _TAPER = 1.5  # by which a raised cosine averages white noise less than equal weights do
 
@@ -196,7 +196,7 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     body_from_measured = sensor.body_from_sensor @ np.linalg.inv(sensor.matrix)
     field_body = (measured - sensor.offset) @ body_from_measured.T
     weakest = int(np.argmin(np.linalg.norm(field_body, axis=1)))
-    if np.linalg.norm(field_body[weakest]) < LEAST_FIELD:
+    if np.linalg.norm(field_body[weakest]) < MIN_FIELD:
         raise InputError(
             f"magnetometer: the field is zero at {time[weakest]:.3f} s, despite the Earth's field;"
             " check the instrument and its calibration, or exclude that part with --start and"

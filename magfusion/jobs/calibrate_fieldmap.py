@@ -23,8 +23,8 @@ from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 
-LONGEST_GAP = 1.0  # s, of the trajectory that is interpolated across
-MOST_POINTS = 600  # the posterior takes the cube of their number
+MAX_GAP = 1.0  # s, of the trajectory that is interpolated across
+MAX_POINTS = 600  # the posterior takes the cube of their number
 UNEXPLAINED = 0.3  # relative error of the mapped field, from which it contradicts the site
 WORSE = 1.2  # the same with the map by that without it
 
@@ -57,9 +57,9 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     else:
         site, points, extra = _from_survey(settings, survey)
         streams = ()
-    if len(points) > MOST_POINTS:
+    if len(points) > MAX_POINTS:
         raise InputError(
-            f"{settings.source}: gives {len(points)} points; a map has at most {MOST_POINTS};"
+            f"{settings.source}: gives {len(points)} points; a map has at most {MAX_POINTS};"
             " choose a larger --spacing"
         )
     report("learning", 1, 2)
@@ -157,7 +157,7 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
         )
     with named(settings.source):
         samples, dropped = _samples(log, site, poses)
-    there, exists = interpolate(poses, samples.time, LONGEST_GAP)
+    there, exists = interpolate(poses, samples.time, MAX_GAP)
     if not np.any(exists):
         raise InputError(f"{settings.source}: the trajectory and the log do not overlap in time")
     sigma = np.sqrt(np.trace(samples.phasor_cov[exists], axis1=2, axis2=3) / 3.0)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 JOB = "calibrate log"
 OF_LOG = ("phase", "time-offset")  # every log has its own: estimated even so
-SHORTEST_PART = 15.0  # s
-MOST_PARTS = 6
+MIN_PART = 15.0  # s
+MAX_PARTS = 6
 MAX_DIFFERENCE_SIGMAS = (
     5.0  # sigmas; the largest of tens of directions, by chance once in thousands
 )
@@ -281,17 +281,17 @@ def _cuts(job: Job, log: Log, site: Site, parts: int | None) -> list[float | Non
     """Return the bounds of the parts, the outer ones those of the job."""
     if parts is None:
         return None
-    if not 2 <= parts <= MOST_PARTS:
-        raise InputError(f"--cross-validate must lie between 2 and {MOST_PARTS}; got {parts}")
+    if not 2 <= parts <= MAX_PARTS:
+        raise InputError(f"--cross-validate must lie between 2 and {MAX_PARTS}; got {parts}")
     if any(beacon.unknown is not None for beacon in site.beacons):
         raise InputError(
             "--cross-validate compares with the survey, but a beacon has none; survey it first"
         )
     first, last = float(log.imu.time[0]), float(log.imu.time[-1])
-    if last - first < parts * SHORTEST_PART:
+    if last - first < parts * MIN_PART:
         raise InputError(
             f"{job.log_path}: {last - first:.3g} s are too short for {parts} parts of at least"
-            f" {SHORTEST_PART:g} s; record longer, or use fewer parts"
+            f" {MIN_PART:g} s; record longer, or use fewer parts"
         )
     inner = np.linspace(first, last, parts + 1)[1:-1]
     return [job.start, *(float(cut) for cut in inner), job.end]

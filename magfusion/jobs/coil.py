@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 DISTANCES = range(1, 11)  # m
 ENAMEL = 1.08  # diameter of enamelled wire over that of its copper
-LARGEST_RATIO = 1.1  # of resistances, without a note
+MAX_RATIO = 1.1  # of resistances, without a note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +136,7 @@ def _alternating(coil: WireCoil, point: OperatingPoint, settings: CoilSettings) 
         ),
         Figure("capacitor_v", point.current * reactance, "V", label="its peak voltage"),
         Figure("quality", reactance / cold, label="quality of the resonance"),
-        Figure("alternating_ratio", ratio, note=note if ratio > LARGEST_RATIO else ""),
+        Figure("alternating_ratio", ratio, note=note if ratio > MAX_RATIO else ""),
         Figure(
             "sensitivity_v_t",
             math.tau * settings.frequency * coil.turns * coil.area,

@@ -28,7 +28,7 @@ from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
 
-MOST_POINTS = 100_000
+MAX_POINTS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +106,9 @@ def _spacing(box: Array, settings: CoverageSettings) -> float:
             raise InputError(f"--height must be finite; got {settings.height:g}")
         size = size[:2]
     spacing = float(np.max(size)) / 20.0 if settings.spacing is None else settings.spacing
-    if float(np.prod(size / spacing + 1.0)) > MOST_POINTS:
+    if float(np.prod(size / spacing + 1.0)) > MAX_POINTS:
         raise InputError(
-            f"--spacing {spacing:g} gives more than {MOST_POINTS} points in the box; choose a"
+            f"--spacing {spacing:g} gives more than {MAX_POINTS} points in the box; choose a"
             " larger spacing, or one height"
         )
     return spacing

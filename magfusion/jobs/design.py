@@ -14,7 +14,7 @@ from magfusion.jobs.budget_figures import PLACES, budget_figures, worst_and_medi
 from magfusion.jobs.coverage import write_points
 from magfusion.jobs.design_figures import best_random_figures, design_figures
 from magfusion.jobs.design_motion import run_motion
-from magfusion.jobs.design_settings import ALL, MOST_BEACONS, DesignSettings
+from magfusion.jobs.design_settings import ALL, MAX_BEACONS, DesignSettings
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
 from magfusion.jobs.simulate import box_option
@@ -31,8 +31,8 @@ from magfusion.results.error_budget import error_budget
 from magfusion.results.figures import Figures
 from magfusion.units import Array
 
-MOST_POINTS, MOST_PLACES = 10_000, 10_000
-LEAST_DRAWN = 15  # random layouts, of which the median is drawn where nothing else is "before"
+MAX_POINTS, MAX_PLACES = 10_000, 10_000
+MIN_DRAWN = 15  # random layouts, of which the median is drawn where nothing else is "before"
 
 
 def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -> Figures:
@@ -58,7 +58,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
         return designed(
             own,
             starts=settings.starts,
-            layouts=max(settings.random, LEAST_DRAWN if alone else 0),
+            layouts=max(settings.random, MIN_DRAWN if alone else 0),
             rng=np.random.default_rng(settings.seed),
             first=first,
             in_time=lambda: time.monotonic() - begin < 60.0 * settings.minutes,
@@ -106,7 +106,7 @@ def _for_need(
         return task, search(task)
     need = settings.limits[0]
     if settings.beacons is None:
-        needed = min_beacons(task, need, most_beacons(task, MOST_BEACONS), search)
+        needed = min_beacons(task, need, most_beacons(task, MAX_BEACONS), search)
     else:
         needed = NeededDesign(task, search(task), reached=True)
     if settings.moment is None and settings.moment_budget is None:
@@ -130,8 +130,8 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
     along = float(np.sum(np.linalg.norm(np.diff(hall.room.edges, axis=1), axis=2)))
     walls = (along / grid + 1.0) * (float(room[2]) / grid + 1.0)
     for name, step, points, maximum in (
-        ("spacing", spacing, float(np.prod(used / spacing + 1.0)), 4 * MOST_POINTS),
-        ("grid", grid, max(walls, float(np.prod(room[:2] / grid + 1.0))), MOST_PLACES),
+        ("spacing", spacing, float(np.prod(used / spacing + 1.0)), 4 * MAX_POINTS),
+        ("grid", grid, max(walls, float(np.prod(room[:2] / grid + 1.0))), MAX_PLACES),
     ):
         if points > maximum:
             raise InputError(
@@ -142,9 +142,9 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
 
 def _points(hall: Hall, spacing: float) -> Array:
     points = points_of_use(hall, spacing)
-    if not 0 < len(points) <= MOST_POINTS:
+    if not 0 < len(points) <= MAX_POINTS:
         raise InputError(
-            f"--spacing {spacing:g} gives {len(points)} points of use; 1 to {MOST_POINTS} are"
+            f"--spacing {spacing:g} gives {len(points)} points of use; 1 to {MAX_POINTS} are"
             " possible; choose another spacing, or in the hall's use another margin_m, or a"
             " polygon_m inside the hall"
         )

@@ -9,7 +9,7 @@ from magfusion.jobs.coil_drive import DriveSettings
 from magfusion.jobs.settings import RandomSettings, RiskSettings, argument, option
 
 ALL = "all"
-MOST_BEACONS, USUAL_BEACONS = 30, 4
+MAX_BEACONS, USUAL_BEACONS = 30, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class DesignSettings(NeedSettings, DriveSettings, RandomSettings):
         None,
         "New beacons to place",
         least=1,
-        most=MOST_BEACONS,
+        most=MAX_BEACONS,
         note="default: 4; with --need as few as reach it",
     )
     hall: Path | None = option(

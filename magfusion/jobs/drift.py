@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 ESTIMATORS: tuple[Estimator, ...] = ("ekf", "smoother")
-SHORTEST, LONGEST = 0.1, 1000.0  # h
+MIN_HOURS, MAX_HOURS = 0.1, 1000.0  # h
 LOOK = 1.0  # s between two looks at how far the runs are
 
 
@@ -45,7 +45,7 @@ class DriftSettings(RandomSettings):
     A declared phase with a clock error is a case that the test must detect.
     """
 
-    hours: float = option(48.0, "Simulated length", unit="h", least=SHORTEST, most=LONGEST)
+    hours: float = option(48.0, "Simulated length", unit="h", least=MIN_HOURS, most=MAX_HOURS)
     estimators: tuple[Literal["ekf", "smoother"], ...] = option(
         ESTIMATORS,
         "Estimator",

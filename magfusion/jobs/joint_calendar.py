@@ -29,7 +29,7 @@ from magfusion.model.parameters import (
 from magfusion.model.trust import Finding
 from magfusion.units import DEGREE, Array
 
-EARLIEST = 946_684_800.0  # s, Unix: 2000-01-01; a log's epoch before it is no date
+MIN_UNIX_S = 946_684_800.0  # s, Unix: 2000-01-01; a log's epoch before it is no date
 EXCHANGED_SIGMAS = 5.0  # of the moments, beyond which a beacon was exchanged rather than moved
 
 
@@ -138,7 +138,7 @@ def _date(time: float) -> np.datetime64:
 def check_dates(times: Sequence[float], names: Sequence[str]) -> None:
     """Raise an error for a log without a date."""
     for time, name in zip(times, names, strict=True):
-        if time < EARLIEST:
+        if time < MIN_UNIX_S:
             raise InputError(
                 f"log {name}: its time {_date(time)} is no date, as --calendar needs; set epoch_ns"
                 " in its log.yaml, ns since 1970"

@@ -31,9 +31,9 @@ from magfusion.simulation.monte_carlo import WorkerPool
 from magfusion.units import Array
 
 CONVERGED_STEP = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
-MOST_ROUNDS = 20
+MAX_ROUNDS = 20
 LARGE = 0.5  # sigmas; rounds that move it by more, and by more each time, are held back
-SMALLEST_SHARE = 0.25
+MIN_SHARE = 0.25
 
 
 class Sums(NamedTuple):
@@ -136,8 +136,8 @@ class Driver:
             Change in the last round, in sigmas.
         """
         moved, share = np.inf, 1.0
-        while moved >= CONVERGED_STEP and sums.rounds < MOST_ROUNDS:
-            self.report("refining together", sums.rounds, MOST_ROUNDS)
+        while moved >= CONVERGED_STEP and sums.rounds < MAX_ROUNDS:
+            self.report("refining together", sums.rounds, MAX_ROUNDS)
             known, every = sums.known, tuple(sums.sums)
             given = [
                 RoundTask(self.files, task, sums.rounds, every, known.step, share)
@@ -149,7 +149,7 @@ class Driver:
             after = sums.known
             before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
             if moved > before and moved > LARGE and sums.rounds > 1:
-                share = max(0.5 * share, SMALLEST_SHARE)
+                share = max(0.5 * share, MIN_SHARE)
         return sums, moved
 
     def months(self, sums: Sums) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from magfusion.files.kept import digest_of_files
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.inputs import Job, read_job, read_site
 from magfusion.jobs.joint_calendar import ChangeReport, check_dates, describe_change
-from magfusion.jobs.joint_driver import MOST_ROUNDS, Driver
+from magfusion.jobs.joint_driver import MAX_ROUNDS, Driver
 from magfusion.jobs.joint_tasks import Alone, LastTask, LogTask, SiteFiles, alone, last, shared_of
 from magfusion.jobs.written import KEPT, SITE_FILES
 from magfusion.model.progress import Report
@@ -256,7 +256,7 @@ def trust_of_all(
         result.append(Finding("silent_beacon", text, weight=50.0))
     if not moved < UNSETTLED:
         text = (
-            f"The logs did not converge to one calibration: the last of {MOST_ROUNDS} rounds still"
+            f"The logs did not converge to one calibration: the last of {MAX_ROUNDS} rounds still"
             f" moved it by {moved:.2g} sigma. Omit the log that is farthest from the others."
         )
         result.append(Finding("not_converged", text))

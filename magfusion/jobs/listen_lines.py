@@ -34,7 +34,7 @@ KINDS = {  # columns by the first word of a line: record, key, number of values
 }
 TABLES = ("imu.gyro", "imu.accel", "magnetometer")
 COUNTER, MICROSECONDS = 1 << 16, 1 << 32
-LONGEST_LINE = 1 << 10  # bytes
+MAX_LINE = 1 << 10  # bytes
 POLL = 0.1  # s
 RESTARTED = 8  # late samples one after the other: the counters began again
 BAUD = 115_200
@@ -173,7 +173,7 @@ class LineSource:
         if not self._is_udp and not self._begun and lines:
             del lines[0]  # its beginning was before the port was opened
             self._begun = True
-        if len(self._rest) > LONGEST_LINE:
+        if len(self._rest) > MAX_LINE:
             self._rest = b""
             self.faults["", "garbled"] += 1
         for line in lines:

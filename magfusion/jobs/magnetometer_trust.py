@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from magfusion.calibration.magnetometer_log import LogCalibration
 
 SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
-SCALE_SIGMAS, LEAST_SCALE = 5.0, 0.01  # of the declared sigma; and what is never an error
+SCALE_SIGMAS, MIN_SCALE = 5.0, 0.01  # of the declared sigma; and what is never an error
 FIRST = 1e3  # weight of what is the cause of other findings
 LOOSE = 0.02  # of the field; an offset that is no more certain than that is not determined
 USELESS = 0.06  # and here nothing is gained by it: three degrees of heading
-SMALLEST, LARGEST = 1.5e-5, 1e-4  # T; the Earth's field, with what steel does to it
+MIN_FIELD, MAX_FIELD = 1.5e-5, 1e-4  # T; the Earth's field, with what steel does to it
 _AXES = "xyz"
 
 
@@ -179,7 +179,7 @@ def _of_another_scale(calibration: LogCalibration, site: Site, log: Log) -> Iter
     declared = site.platform.magnetometer.matrix
     ratio = float(np.cbrt(np.linalg.det(calibration.graph.fit.matrix) / np.linalg.det(declared)))
     sigma = float(np.sqrt(np.mean(np.diagonal(calibration.prior.cov)[[0, 4, 8]]) / 3.0))
-    far = abs(ratio - 1.0) / min(SCALE, SCALE_SIGMAS * max(sigma, LEAST_SCALE))
+    far = abs(ratio - 1.0) / min(SCALE, SCALE_SIGMAS * max(sigma, MIN_SCALE))
     if far < 1.0:
         return
     text = (
@@ -211,13 +211,13 @@ def _of_another_size(calibration: LogCalibration, site: Site) -> Iterator[Findin
         " about all its axes, and declare a larger sigma of its offset"
     )
     if site.earth_field_world is None:
-        if not SMALLEST < size < LARGEST:
+        if not MIN_FIELD < size < MAX_FIELD:
             yield Finding(
                 "earth_field",
                 f"The calibrated field is {1e6 * size:.3g} uT, outside the Earth's 22 to 67."
                 f"{remedy}; or give the local field (earth_field_t).",
                 Verdict.FAILED,
-                size / LARGEST,
+                size / MAX_FIELD,
             )
         return
     declared = float(np.linalg.norm(site.earth_field_world))

@@ -18,7 +18,7 @@ from magfusion.units import DEGREE, NANOTESLA, Array
 if TYPE_CHECKING:
     from magfusion.jobs.attitude_database import Steady
 
-FEW = 0.05  # share of epochs that may be undetermined
+MAX_UNDETERMINED = 0.05  # share of epochs that may be undetermined
 OTHER_SIZE = 0.3  # of the Earth's field, by which it contradicts the site
 EXPLAINED = 1.5  # residual by what is declared, as of whitened residuals
 # Remaining degrees of freedom of a field vector for each number of estimated angles.
@@ -87,13 +87,13 @@ def _sensor_sigma(site: Site, size: float) -> float:
 
 def _undetermined(matches: Matches) -> Iterator[Finding]:
     count, missing = len(matches.determined), int(np.sum(~matches.determined[:, 0]))
-    if missing > FEW * count:
+    if missing > MAX_UNDETERMINED * count:
         yield Finding(
             "geometry",
             f"{missing} of {count} epochs have no attitude: the field is nearly parallel to the"
             " requested axes, is not in the database, or the platform moves. They are marked in"
             " attitude.parquet (determined); add gravity at rest (--gravity), or beacons.",
-            weight=missing / count / FEW,
+            weight=missing / count / MAX_UNDETERMINED,
         )
     both = int(np.sum(matches.ambiguous))
     if both:

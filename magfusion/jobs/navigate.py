@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.checkpoint import CheckpointWriter
     from magfusion.jobs.navigate_results import NavigateResults
 
-LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
+MAX_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
 
 
 def run(
@@ -160,7 +160,7 @@ def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
         )
     if log.waveform is None and log.fields is not None:
         longest = float(max(log.fields.window))
-        if longest > LONGEST_EPOCH:
+        if longest > MAX_EPOCH:
             raise InputError(
                 f"{path}: has whole rests, of up to {longest:.3g} s, which are known only after"
                 " their end; run magfusion fix or smooth, or navigate the raw log"

@@ -17,7 +17,7 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE
 
-LEAST_SNR = 5.0  # of the strongest window
+MIN_SNR = 5.0  # of the strongest window
 VAGUE = 0.2  # of the distance
 
 
@@ -115,7 +115,7 @@ def _judge_ranging(log: Log, ranging_log: RangingLog, ranging: Ranged) -> tuple[
     snr = np.abs(fields.phasor_sensor[:, 0]) ** 2
     noise = np.trace(fields.phasor_cov[:, 0], axis1=1, axis2=2)
     strongest = float(np.sqrt(np.max(np.sum(snr, axis=1) / np.maximum(noise, 1e-300))))
-    if strongest < LEAST_SNR:
+    if strongest < MIN_SNR:
         text = f"Signal below noise (SNR {strongest:.2g}). Reduce the distance."
         findings.append(Finding("low_signal", text, Verdict.FAILED))
     if not ranging_log.high_side:

@@ -15,7 +15,7 @@ from magfusion.units import Array
 if TYPE_CHECKING:
     from magfusion.model.site import Site
 
-LARGEST = 1e6  # m
+MAX_COORDINATE = 1e6  # m
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ def _box(text: str) -> Array:
         raise InputError(
             f"--region {text!r}: each lower limit must be below its upper limit, and one finite"
         )
-    if np.max(np.abs(limits)) > LARGEST:
-        raise InputError(f"--region {text!r}: limits must lie within {LARGEST:g} m of the origin")
+    if np.max(np.abs(limits)) > MAX_COORDINATE:
+        raise InputError(
+            f"--region {text!r}: limits must lie within {MAX_COORDINATE:g} m of the origin"
+        )
     return box

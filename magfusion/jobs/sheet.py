@@ -30,7 +30,7 @@ from magfusion.units import Array
 if TYPE_CHECKING:
     from magfusion.results.plots.sheet import CheckRow
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +105,9 @@ def _with_marks(
     height = max(float(hall.use.heights[0]) - floor, 0.0)
     lowest = Prism(hall.use.polygon, np.full(2, floor + height))
     size = np.ptp(hall.use.polygon, axis=0)
-    if float(np.prod(size / settings.spacing + 1.0)) > MOST_POINTS:
+    if float(np.prod(size / settings.spacing + 1.0)) > MAX_POINTS:
         raise InputError(
-            f"--spacing {settings.spacing:g} gives more than {MOST_POINTS} possible marks; choose"
+            f"--spacing {settings.spacing:g} gives more than {MAX_POINTS} possible marks; choose"
             " a larger value"
         )
     points = points_of_use(replace(hall, use=lowest), settings.spacing)

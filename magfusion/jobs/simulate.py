@@ -32,7 +32,7 @@ from magfusion.simulation.steel_worlds import KINDS, check_clear, draw_steel, st
 from magfusion.simulation.waveform import usual_rate_hz
 from magfusion.units import Array
 
-LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
+MAX_BOX, MIN_BOX = 1e5, 1e-3  # m
 DRIFT_TIME = 600.0  # s
 RECORDING = "recording.wav"
 LATE = 0.037  # s; the clock of a reference
@@ -128,10 +128,10 @@ def box_option(text: str | None) -> Array | None:
         ) from None
     if not np.all(np.isfinite(box)) or np.any(box[0] >= box[1]):
         raise InputError(f"--box {text!r}: each lower limit must be below its upper limit")
-    if np.max(np.abs(box)) > LARGEST_BOX or np.min(box[1] - box[0]) < SMALLEST_BOX:
+    if np.max(np.abs(box)) > MAX_BOX or np.min(box[1] - box[0]) < MIN_BOX:
         raise InputError(
-            f"--box {text!r}: limits must lie within {LARGEST_BOX:g} m of the origin and at least"
-            f" {SMALLEST_BOX:g} m apart"
+            f"--box {text!r}: limits must lie within {MAX_BOX:g} m of the origin and at least"
+            f" {MIN_BOX:g} m apart"
         )
     return box
 
@@ -144,9 +144,9 @@ def reference_option(text: str | None) -> Reference | None:
         place = np.array([float(part) for part in text.split(",")]).reshape(3)
     except ValueError:
         place = np.full(3, np.nan)
-    if not np.all(np.abs(place) <= LARGEST_BOX):
+    if not np.all(np.abs(place) <= MAX_BOX):
         raise InputError(
-            f"--reference {text!r}: give three numbers in metres, x, y, z within {LARGEST_BOX:g} m"
+            f"--reference {text!r}: give three numbers in metres, x, y, z within {MAX_BOX:g} m"
             " of the origin"
         )
     return Reference(place, late=LATE)

@@ -25,7 +25,7 @@ from magfusion.simulation.pipe import Pipe, Steel
 from magfusion.simulation.rails import steel_along_wells
 from magfusion.simulation.rotor import Pass, Surroundings, simulate_transits
 from magfusion.simulation.shaft import ShaftErrors, draw_shaft
-from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
+from magfusion.simulation.waveform import MIN_SAMPLES_PER_CYCLE
 from magfusion.simulation.wells import TwoWells, drawn_steel, lean_of
 from magfusion.units import DEGREE
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-LEAST_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
+MIN_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
 WAY_POINTS = 500  # of a magnet's way, where steel is too near to it
-LEAST_SHARE, MOST_SEGMENT = 0.05, 0.5  # of a segment of steel: of the distance, and in m
+MIN_SHARE, MAX_SEGMENT = 0.05, 0.5  # of a segment of steel: of the distance, and in m
 AHEAD = 2.0  # m, at most, of the magnet from where it is abreast, in the middle of its depths
 
 
@@ -112,11 +112,11 @@ def simulate_ranging(
     assert rotor is not None
     highest = max((1, *(one.order for one in rotor.harmonics)))
     fastest_hz = highest * site.beacons[0].frequency_hz
-    rate_hz = rate_hz or max(LEAST_RATE_HZ, SAMPLES_PER_TURN * fastest_hz)
-    if rate_hz < LEAST_SAMPLES_PER_CYCLE * fastest_hz:
+    rate_hz = rate_hz or max(MIN_RATE_HZ, SAMPLES_PER_TURN * fastest_hz)
+    if rate_hz < MIN_SAMPLES_PER_CYCLE * fastest_hz:
         raise InputError(
             f"--rate {rate_hz:g}: the rotor's fastest tone has {fastest_hz:g} Hz; give at least"
-            f" {LEAST_SAMPLES_PER_CYCLE * fastest_hz:g} Hz"
+            f" {MIN_SAMPLES_PER_CYCLE * fastest_hz:g} Hz"
         )
     shaft, wells = draw_shaft(rotor, settings.shaft_errors(), rng), laid_wells(entry, rng)
     sensor = true_site.platform.magnetometer
@@ -165,7 +165,7 @@ def _around(
         true = drawn_steel(casing, rng) if perturb else casing
         half = 0.5 * wells.well_distance + wells.reach + wells.distance
         radius = casing.radius + 0.5 * casing.wall
-        segment = min(LEAST_SHARE * wells.distance, MOST_SEGMENT)
+        segment = min(MIN_SHARE * wells.distance, MAX_SEGMENT)
         built = true.wall, true.permeability, true.conductivity
         steel = Steel((wells.casing(half, radius, built, segment), *neighbour), about=0)
     elif neighbour:

@@ -9,7 +9,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
-from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
+from magfusion.estimation.data_checks.stream_buffer import MAX_JUMP
 from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.measurements.signs import along_axis
@@ -103,7 +103,7 @@ def _navigate(
     refused, saved, reached = 0, -np.inf, -np.inf
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
-    if not 0.0 <= begun.extra <= max(navigator.newest + LARGEST_JUMP, 0.0):
+    if not 0.0 <= begun.extra <= max(navigator.newest + MAX_JUMP, 0.0):
         raise InputError(f"{place}: the time that a counter lost is wrong; run without --resume")
     clocks = StreamClocks(settings.navigator.delay, navigator.newest, begun.extra)
 

@@ -7,14 +7,14 @@ from typing import NamedTuple, TextIO
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
+from magfusion.estimation.data_checks.stream_buffer import MAX_JUMP
 from magfusion.files.records import Record
 from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import NumberedRecord
 from magfusion.model.counters import NEAR_END, lost_by_wrapping
 from magfusion.units import Array
 
-LEAST_STEP = 1.0  # s back; a network delays a record by less
+MIN_STEP = 1.0  # s back; a network delays a record by less
 NEW_CLOCK = 10.0  # s of data, all before a checkpoint, are of a clock that began again
 
 
@@ -62,7 +62,7 @@ class StreamClocks:
     """
 
     def __init__(self, delay: float, last: float = -np.inf, wrapped: float = 0.0) -> None:
-        self._least, self._delay = max(LEAST_STEP, 2.0 * delay), delay
+        self._least, self._delay = max(MIN_STEP, 2.0 * delay), delay
         self._clocks: dict[str, _Clock] = {}
         self._resumed = _Clock(last_stamp=last, wrapped=wrapped)
 
@@ -102,7 +102,7 @@ class StreamClocks:
         if new:  # the counter is that of the other streams
             other = max(self._clocks.values(), key=lambda one: one.last_stamp)
             clock.last_stamp, clock.wrapped = other.last_stamp, other.wrapped
-        near = LARGEST_JUMP if new else NEAR_END
+        near = MAX_JUMP if new else NEAR_END
         missing = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped, near)
         clock.last_stamp, clock.wrapped = float(times[-1] + missing[-1]), float(missing[-1])
         return missing
@@ -111,9 +111,7 @@ class StreamClocks:
         """Return the step of a stream's clock: it is seen in the second record after it."""
         for name, times in _streams(record):
             clock, first = self._of(name), float(times[0])
-            follows = (
-                clock.unconfirmed is not None and 0.0 <= first - clock.unconfirmed < LARGEST_JUMP
-            )
+            follows = clock.unconfirmed is not None and 0.0 <= first - clock.unconfirmed < MAX_JUMP
             if follows and self._is_far(clock, times):
                 seen = clock.newest if clock.newest > -np.inf else self._newest
                 step = ClockStep(name, first, first - seen)
@@ -172,7 +170,7 @@ class StreamClocks:
     def _is_far(self, clock: _Clock, times: Array) -> bool:
         """Return whether all stamps are behind the newest, or ahead of those of all streams."""
         behind = float(np.max(times)) < clock.newest - self._least
-        return behind or -np.inf < self._newest < float(np.min(times)) - LARGEST_JUMP
+        return behind or -np.inf < self._newest < float(np.min(times)) - MAX_JUMP
 
 
 class OlderRecords:
@@ -220,8 +218,8 @@ class OlderRecords:
         older = -np.inf < newest < self._until
         if older:
             step = newest - self._newest
-            far = newest < self._until - LARGEST_JUMP
-            single = not abs(step) < LARGEST_JUMP
+            far = newest < self._until - MAX_JUMP
+            single = not abs(step) < MAX_JUMP
             self._span = self._span + max(step, 0.0) if far and not single else 0.0
             self._newest = newest if single else max(newest, self._newest)
         return older

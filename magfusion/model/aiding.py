@@ -16,7 +16,7 @@ Quantity = Literal[
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 OF_MOTION: tuple[Quantity, ...] = ("velocity", "position", "relative_pose")  # of three axes
 AIDING_RATE = 10.0  # Hz; what a vehicle does between is measured by the IMU
-LONGEST_INTERVAL = 2.0  # s of a relative pose, in which the noise of an IMU is still small
+MAX_INTERVAL = 2.0  # s of a relative pose, in which the noise of an IMU is still small
 _COMPONENTS: dict[Quantity, int] = {"velocity": 3, "position": 3, "mark": 0, "relative_pose": 7}
 
 

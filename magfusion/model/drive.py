@@ -14,8 +14,8 @@ import numpy as np
 from magfusion.units import Array, BoolArray, ComplexArray
 
 MAX_READINGS = 1000  # readings of each channel, or part, that a running estimator keeps
-LEAST_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
-LEAST_ON = 0.05  # of the declared current; below, the drive is off and has no phase
+MIN_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
+MIN_CURRENT_SHARE = 0.05  # of the declared current; below, the drive is off and has no phase
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class DriveShares:
             angle = np.unwrap(np.append(known[2, -1], angle))[1:]
         else:
             angle = np.unwrap(angle)
-        size = np.log(np.maximum(np.abs(share), LEAST_SHARE))
+        size = np.log(np.maximum(np.abs(share), MIN_SHARE))
         self.readings[key] = np.concatenate([known, [time, size, angle]], axis=1)
 
     def discard_old(self) -> None:
@@ -79,6 +79,6 @@ class DriveShares:
 
 def _gone_on(known: Array) -> Array:
     """Return readings with one extrapolated reading, where the drive was on."""
-    if known.shape[1] < 2 or np.min(known[1, -2:]) < np.log(LEAST_ON):
+    if known.shape[1] < 2 or np.min(known[1, -2:]) < np.log(MIN_CURRENT_SHARE):
         return known
     return np.column_stack([known, 2.0 * known[:, -1] - known[:, -2]])

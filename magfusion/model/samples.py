@@ -16,7 +16,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-LONGEST_IN_MOTION = 5.0  # s; of a window, unless the platform rests
+MAX_MOVING_WINDOW = 5.0  # s; of a window, unless the platform rests
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class FieldSamples:
     @property
     def of_rests(self) -> bool:
         """Whether each epoch is a whole stationary interval: long, without overlap."""
-        if len(self) == 0 or float(np.max(self.window)) <= LONGEST_IN_MOTION:
+        if len(self) == 0 or float(np.max(self.window)) <= MAX_MOVING_WINDOW:
             return False
         end, begin = self.time + 0.5 * self.window, self.time - 0.5 * self.window
         return bool(np.all(begin[1:] >= end[:-1] - 1e-6))

@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-LONGEST = 200  # characters; two lines of a terminal
-LONGEST_TEXT = 40
+MAX_CHARACTERS = 200  # characters; two lines of a terminal
+MAX_TEXT = 40
 
 
 class _Dataclass(Protocol):
@@ -25,9 +25,9 @@ def short_repr(self: _Dataclass) -> str:
 
 
 def one_line(name: str, parts: list[str]) -> str:
-    """Return a name with facts in parentheses, truncated at `LONGEST`."""
+    """Return a name with facts in parentheses, truncated at `MAX_CHARACTERS`."""
     line = f"{name}({', '.join(parts)})"
-    return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
+    return line if len(line) <= MAX_CHARACTERS else f"{line[: MAX_CHARACTERS - 4]}...)"
 
 
 def _absent(value: object, default: object) -> bool:
@@ -47,6 +47,6 @@ def _shown(value: object) -> str:
         return str(value)
     if isinstance(value, str):
         text = str(value)
-        return repr(text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 3]}...")
+        return repr(text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}...")
     length = f"[{len(value)}]" if isinstance(value, Sized) else ""
     return f"{type(value).__name__}{length}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.units import Array, ComplexArray
 
-LONGEST = 0.25  # s; of a slip
+MAX_DURATION = 0.25  # s; of a slip
 SIDE = 0.15  # s; of the amplitudes that are compared on each side
 INDEPENDENT = 1.0 / 120.0  # s; between amplitudes in bands of 120 Hz
 GRID = 4e-3  # s; within which the covariance of the amplitudes changes little
@@ -23,7 +23,7 @@ MIN_SNR = 5.0  # of an amplitude in a band
 LIKELIHOOD_RATIO = 12.0  # log of the likelihood ratio
 SWITCHED = -20.0  # log of the prior odds that a tone steps alone
 NEAR = 2  # samples
-MOST_NAMED = 4  # lengths
+MAX_LISTED = 4  # lengths
 DEGREE = 7  # of the smooth amplitudes over both sides
 POOR = 0.1  # part of the amplitudes that the best length leaves unexplained
 
@@ -50,7 +50,7 @@ def log_likelihoods(
     referred to it by the tones' phases. `noise` (tones,): standard deviation of each real part of
     an amplitude. `tones_hz` (tones,).
     """
-    lengths = np.arange(round(LONGEST * rate_hz) + 1)
+    lengths = np.arange(round(MAX_DURATION * rate_hz) + 1)
     step = max(round(GRID * rate_hz), 1)
     grid = np.arange(0, lengths[-1] + step, step)
     split, columns = len(before[0]), before[1].shape[2]
@@ -97,7 +97,7 @@ def choose_length(likelihoods: Array) -> tuple[int, tuple[int, ...]]:
     best = int(np.argmax(likelihoods))
     result: list[int] = []
     largest = likelihoods[best]
-    while len(result) < MOST_NAMED:
+    while len(result) < MAX_LISTED:
         at = int(np.argmax(likelihoods))
         if likelihoods[at] < largest - LIKELIHOOD_RATIO:
             break

@@ -17,9 +17,9 @@ from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 
 STEPS = 4  # least samples between two epochs: rate noise within a step is neglected
-LONGEST_STEP = 0.02  # s
+MAX_STEP = 0.02  # s
 # Negligible noise that keeps factors regular: rad/s/sqrt(Hz), m/s^2 and the latter per root s.
-LEAST_GYRO, LEAST_ACCEL = 1e-4, 1e-4
+MIN_GYRO, MIN_ACCEL = 1e-4, 1e-4
 EXAMPLE = "{accel_density_m_s2_rthz: 2, angular_accel_density_rad_s2_rthz: 3}"
 
 
@@ -32,12 +32,12 @@ def on_motion_prior(site: Site) -> Site:
         return site
     prior = site.platform.motion_prior or MotionPrior()
     imu = ImuModel(
-        gyro_noise=LEAST_GYRO,
+        gyro_noise=MIN_GYRO,
         accel_noise=prior.accel_density,
         gyro_bias_walk=prior.angular_accel_density,
-        accel_bias_walk=LEAST_ACCEL,
+        accel_bias_walk=MIN_ACCEL,
         gyro_bias_sigma=prior.rate_sigma,
-        accel_bias_sigma=LEAST_ACCEL,
+        accel_bias_sigma=MIN_ACCEL,
         time_offset_sigma=0.0,
         clock_rate_sigma=0.0,
     )
@@ -90,7 +90,7 @@ def without_imu(log: Log, site: Site) -> tuple[Log, Site]:
         if s is not None and len(s)
     ]
     first, last = min(float(t[0]) for t in times), max(float(t[-1]) for t in times)
-    step, length = LONGEST_STEP, 0.0
+    step, length = MAX_STEP, 0.0
     if log.fields is not None and len(log.fields) > 1:
         step = min(step, float(np.median(np.diff(log.fields.time))) / STEPS)
         length = float(np.max(log.fields.window))

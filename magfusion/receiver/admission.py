@@ -22,9 +22,9 @@ NO_INERTIAL = "no inertial data"
 INERTIAL_GAP = "gap in the inertial stream"
 REASONS = (MAGNETOMETER_GAP, TOO_FEW, STILL, SATURATED, NO_INERTIAL, INERTIAL_GAP)
 
-MOST_GROWTH = 4.0  # largest growth of a phasor's variance by missing samples
-LONGEST_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
-LATEST_USE = 0.6  # steps before a window's end after which no inertial sample is needed
+MAX_GROWTH = 4.0  # largest growth of a phasor's variance by missing samples
+MAX_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
+MAX_UNCOVERED_STEPS = 0.6  # steps before a window's end after which no inertial sample is needed
 ROUNDING = 1e-6  # of a step; tolerance for rounding of a window's limits
 
 
@@ -173,7 +173,7 @@ class Admission:
         few = (windows.count + self.slack) * step < self.least_share * windows.length
         requested = lacking & ~few
         if requested.any():
-            lacking[requested] = growth(windows.rows(requested), time) > MOST_GROWTH
+            lacking[requested] = growth(windows.rows(requested), time) > MAX_GROWTH
         drop(MAGNETOMETER_GAP, lacking)
         drop(TOO_FEW, few)
         last = windows.first + windows.count
@@ -184,7 +184,7 @@ class Admission:
         drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)
         if self.needs_turn:
             silence = silences(imu_time, self.imu_step, self.imu_margin)
-            drop(INERTIAL_GAP, meets(*silence, begin, end - LATEST_USE * step))
+            drop(INERTIAL_GAP, meets(*silence, begin, end - MAX_UNCOVERED_STEPS * step))
         return result
 
 
@@ -193,7 +193,7 @@ _NEVER = np.array([np.inf])
 
 def longest_step(step: float) -> float:
     """Return the longest time between two inertial samples that is no gap, of the usual one (s)."""
-    return max(3.0 * step, LONGEST_GAP)
+    return max(3.0 * step, MAX_GAP)
 
 
 def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]:
@@ -214,7 +214,7 @@ def meets_silence(
     `step`: usual time between two samples of the magnetometer (s). `silence`: as from `silences`.
     """
     begin, end = windows.centre - length / 2.0, windows.centre + length / 2.0
-    return meets(*silence, begin, end - LATEST_USE * step)
+    return meets(*silence, begin, end - MAX_UNCOVERED_STEPS * step)
 
 
 def meets(begin: Array, end: Array, span_begin: Array, span_end: Array) -> BoolArray:

@@ -13,7 +13,7 @@ import numpy as np
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 Removal = Literal["none", "subtract", "interpolate", "state"]
-LEAST_TURNS = (
+MIN_TURNS = (
     1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
 )
 HARMONICS = (1, 3, 5)  # of the mains, whose waveform is symmetric
@@ -74,8 +74,8 @@ def ambient_weights(
     if removal == "interpolate":
         return _interpolated(driven, silent, after, count)
     alias = _alias(mains_turns, count)
-    if alias * (STRETCH * cycles - 1) >= LEAST_TURNS:
-        cycles = max(cycles, int(np.ceil(LEAST_TURNS / alias)) + 1)
+    if alias * (STRETCH * cycles - 1) >= MIN_TURNS:
+        cycles = max(cycles, int(np.ceil(MIN_TURNS / alias)) + 1)
     per_cycle = len(np.unique(silent % count))
     number = min(cycles * per_cycle, len(silent))
     first = np.clip(after - number // 2, 0, len(silent) - number)
@@ -102,7 +102,7 @@ def _alias(mains_turns: float, count: int) -> float:
 def _state_design(elapsed: Array, near: Array, count: int, mains_turns: float) -> Array:
     span = np.ptp(elapsed, axis=1).max() / count  # cycles
     columns = [np.ones_like(elapsed), elapsed / (span * count + 1.0)]
-    if span * _alias(mains_turns, count) >= LEAST_TURNS:
+    if span * _alias(mains_turns, count) >= MIN_TURNS:
         angle = 2.0 * np.pi * mains_turns * elapsed
         # The ambient field at the driven slot includes the mains: cos(0) = 1 there, so that the
         # constant, less the cosine's own column, has both.

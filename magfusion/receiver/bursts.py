@@ -11,7 +11,7 @@ from magfusion.units import Array, IntArray
 
 TOGETHER = 0.2  # of the mean step; samples closer than that arrived in one burst
 SHARE = 0.4  # least share of such short steps where samples come in bursts
-LONGEST = 0.1  # s without a sample; a longer pause is a switched stream, not a bus
+MAX_PAUSE = 0.1  # s without a sample; a longer pause is a switched stream, not a bus
 MAX_SAMPLES = 64  # samples in a burst
 MIN_SAMPLES = 64  # in which bursts are recognised
 CLUSTERS = 2.5  # times a step within a burst; the least pause. A lost sample makes a step of two
@@ -34,11 +34,11 @@ def burst_limit(stamps: Array) -> float | None:
     `stamps` (n,): strictly increasing (s).
     """
     step = np.diff(stamps)
-    if len(stamps) < MIN_SAMPLES or np.sum(step < 2.0 * LONGEST) < MIN_SAMPLES // 2:
+    if len(stamps) < MIN_SAMPLES or np.sum(step < 2.0 * MAX_PAUSE) < MIN_SAMPLES // 2:
         return None
     limit = shortest_pause(step)
     short, pause = step[step <= limit], step[step > limit]
-    if len(short) < SHARE * len(step) or len(pause) < 2 or np.median(pause) > LONGEST:
+    if len(short) < SHARE * len(step) or len(pause) < 2 or np.median(pause) > MAX_PAUSE:
         return None
     last = np.append(np.flatnonzero(step > limit), len(stamps) - 1)
     if np.median(np.diff(last, prepend=-1)) > MAX_SAMPLES:
@@ -46,7 +46,7 @@ def burst_limit(stamps: Array) -> float | None:
     inner = float(np.median(short))
     if inner > RESOLVED and _is_switched(short, pause, np.diff(last)):
         return None
-    together = np.max(short) <= TOGETHER * np.mean(step[step < 2.0 * LONGEST])
+    together = np.max(short) <= TOGETHER * np.mean(step[step < 2.0 * MAX_PAUSE])
     return limit if together or _keeps_to_a_rate(stamps, last, inner) else None
 
 
@@ -55,7 +55,7 @@ def shortest_pause(step: Array) -> float:
 
     `step` (n,): between samples (s).
     """
-    inside = step[step < 2.0 * LONGEST]
+    inside = step[step < 2.0 * MAX_PAUSE]
     mean = float(np.mean(inside)) if len(inside) else 0.0
     short, pause = inside[inside <= mean], inside[inside > mean]
     if not len(short) or not len(pause):

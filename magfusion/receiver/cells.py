@@ -20,7 +20,7 @@ from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, IntArray
 
 PITCH = 2.0  # m; of the grid in the plane
-MOST_NODES = 20_000  # in the plane; a larger site has a coarser grid
+MAX_NODES = 20_000  # in the plane; a larger site has a coarser grid
 LEVELS = 3  # of height
 OUTSIDE = 4.0  # m; by which the grid exceeds the extent of the beacons
 LOWEST_SPAN = 3.0  # m; of heights, where all beacons are at one
@@ -105,7 +105,7 @@ def _grid_of(site: Site) -> _Grid:
     if high[2] - low[2] < LOWEST_SPAN:
         middle = 0.5 * (high[2] + low[2])
         low[2], high[2] = middle - 0.5 * LOWEST_SPAN, middle + 0.5 * LOWEST_SPAN
-    pitch = max(PITCH, float(np.sqrt(np.prod(high[:2] - low[:2]) / MOST_NODES)))
+    pitch = max(PITCH, float(np.sqrt(np.prod(high[:2] - low[:2]) / MAX_NODES)))
     x, y = (np.arange(low[i], high[i] + pitch, pitch) for i in range(2))
     axes = x, y, np.linspace(low[2], high[2], LEVELS)
     node = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

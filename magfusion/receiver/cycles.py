@@ -9,12 +9,12 @@ from magfusion.model.marks import SILENT, Marks
 from magfusion.model.quaternion import matrices
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
-from magfusion.receiver.marked_bursts import LONGEST_EPOCH
+from magfusion.receiver.marked_bursts import MAX_EPOCH
 from magfusion.receiver.slots import is_marked, schedule
 from magfusion.receiver.turn import Turn, on_clock, turn_of
 from magfusion.units import Array, BoolArray, IntArray
 
-LONGEST_PAUSE = 4.0  # usual ones; a longer one ends a marked cycle
+MAX_PAUSE = 4.0  # usual ones; a longer one ends a marked cycle
 
 
 def joins(site: Site, marks: Marks | None = None) -> bool:
@@ -26,12 +26,12 @@ def joins(site: Site, marks: Marks | None = None) -> bool:
         if marks is None:
             return False
         own = marks.rows(marks.slot != SILENT)
-        epoch = _marked(0.5 * (own.begin + own.end), own.slot, longest=LONGEST_EPOCH)
+        epoch = _marked(0.5 * (own.begin + own.end), own.slot, longest=MAX_EPOCH)
         whole = np.bincount(epoch) == len(site.channels)
         return bool(len(epoch) and np.mean(whole) > 0.5)
     slots = schedule(site)
     driven = [slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None]
-    return bool((max(driven) - min(driven)) * slots.duration <= LONGEST_EPOCH)
+    return bool((max(driven) - min(driven)) * slots.duration <= MAX_EPOCH)
 
 
 def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
@@ -117,7 +117,7 @@ def cycle_of(samples: FieldSamples, site: Site) -> IntArray:
     """
     if is_marked(site):
         usual = float(np.median(np.diff(samples.time))) if len(samples) > 1 else 0.0
-        return _marked(samples.time, np.argmax(samples.valid, axis=1), pause=LONGEST_PAUSE * usual)
+        return _marked(samples.time, np.argmax(samples.valid, axis=1), pause=MAX_PAUSE * usual)
     slots = schedule(site)
     slot = np.array([slot for beacon in site.beacons for _, slot in beacon.tones], dtype=float)
     count = np.maximum(np.sum(samples.valid, axis=1), 1)

@@ -16,7 +16,7 @@ from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
 CHUNK = 64  # windows demodulated at once, so that their arrays fit the CPU cache
-LARGEST = 2**28  # bytes of the maps of one chunk; many tones in long windows shrink the chunk
+MAX_BYTES = 2**28  # bytes of the maps of one chunk; many tones in long windows shrink the chunk
 KEPT = 256 * 2**20  # bytes of cached maps; others are recomputed
 EVEN_KEPT = 64  # maps of evenly spaced samples
 MIN_SHARED_WINDOWS = 4  # windows for each of their spacings
@@ -75,7 +75,7 @@ class Designs:
         """Return how many windows are demodulated at once."""
         maximum = int(self.windows.count.max(initial=1))
         columns = 6 * len(self.frequencies_hz) + 2
-        return min(max(LARGEST // (8 * maximum * columns), 1), CHUNK)
+        return min(max(MAX_BYTES // (8 * maximum * columns), 1), CHUNK)
 
     def _size(self) -> int:
         return sum(map(_size, self.kept.values()))

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.drive import LEAST_ON, DriveSamples, DriveShares
+from magfusion.model.drive import MIN_CURRENT_SHARE, DriveSamples, DriveShares
 from magfusion.model.site import Beacon, MarkedSlots, Site
 from magfusion.receiver.slots import has_schedule, schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array, ComplexArray
 
-LEAST_SAMPLES = 0.9  # of a whole window
+MIN_SAMPLES = 0.9  # of a whole window
 A_STEP = 4  # windows that begin within a step of the lock-in: shares are linear in between
 EDGE = 0.05  # of a slot, at each end: there the current rises and falls
 LEARNT = 0.02  # weight of a window in the noise estimate
@@ -165,7 +165,7 @@ class DriveReceiver:
             channels = tuple(c for c in channels if c.slot == slot)
             first, length = first + EDGE * length, (1.0 - 2.0 * EDGE) * length
         rows = slice(*np.searchsorted(self.time, [first, first + length]))
-        if rows.stop - rows.start < LEAST_SAMPLES * length / self.step - 1.0:
+        if rows.stop - rows.start < MIN_SAMPLES * length / self.step - 1.0:
             return
         elapsed = self.time[rows] - (first + 0.5 * length)
         for k, column in enumerate(self.columns):
@@ -180,7 +180,7 @@ class DriveReceiver:
     ) -> Iterator[tuple[Channel, complex]]:
         for channel, value in zip(channels, current, strict=True):
             size = abs(value) / abs(channel.declared)
-            if size < LEAST_ON:
+            if size < MIN_CURRENT_SHARE:
                 yield channel, 0.0  # off: no phase
                 continue
             noise = sigma / abs(value)

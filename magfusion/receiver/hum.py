@@ -8,7 +8,7 @@ from magfusion.model.samples import Waveform
 from magfusion.units import Array, ComplexArray
 
 SPAN = 1.0  # s; length of the tracking windows, which overlap by half
-MOST_ORDERS = 6
+MAX_ORDERS = 6
 HIGHEST = 0.95  # of half the sampling rate
 COHERENT = 0.5  # coherence of successive windows; of noise it is one sixth
 SMOOTHED = 5  # windows
@@ -37,7 +37,7 @@ def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
     `mains_hz`: nominal frequency; zero for none.
     """
     step = float(np.median(np.diff(waveform.time)))
-    orders = np.arange(1.0, MOST_ORDERS + 1.0)
+    orders = np.arange(1.0, MAX_ORDERS + 1.0)
     orders = orders[orders * mains_hz < HIGHEST * 0.5 / step]
     if mains_hz <= 0.0 or not len(orders):
         return None

@@ -17,7 +17,7 @@ from magfusion.units import Array, ComplexArray
 NEAREST, MAX_NEIGHBOURS = 2, 12  # resolutions: the first whose power is noise; how many
 MIN_NEIGHBOURS = 3
 FARTHEST = 0.4  # of the inverse length of a piece, at which its taper still has gain
-LEAST_LENGTHS = (NEAREST + MIN_NEIGHBOURS) / FARTHEST  # of a piece, in a stationary interval
+MIN_LENGTHS = (NEAREST + MIN_NEIGHBOURS) / FARTHEST  # of a piece, in a stationary interval
 LEVEL = 31  # pieces over which the noise level is estimated
 HUBER = 2.0  # times the noise level, beyond which a piece is down-weighted
 ROUNDS = 3

@@ -18,14 +18,14 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.admission import WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.design import nuisances_hz
-from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
+from magfusion.receiver.lockin_receiver import MIN_SHARE, LockinReceiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array
 
 SHORT_WINDOW = 0.2  # s
 NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: changes in between are a parabola
-LONGEST_APART = 1.0  # s; longer windows to separate tones hold too much motion
+MAX_SEPARATING_WINDOW = 1.0  # s; longer windows to separate tones hold too much motion
 SAME_TIMES = 1e-8  # s; sample times that are no farther apart have the same design
 MIN_SINGULAR_VALUE = 1e-3  # of the largest singular value; smaller ones carry no information
 PROBES = 6  # on either side of the tones, a window's resolution apart
@@ -70,7 +70,7 @@ def _long(site: Site, requested: LockinSettings | None) -> LockinSettings | None
     if any(beacon.unknown is not None or not beacon.tones for beacon in site.beacons):
         return None
     usual = default_settings(site)
-    return None if usual.window <= LONGEST_APART else usual
+    return None if usual.window <= MAX_SEPARATING_WINDOW else usual
 
 
 class JointDesign(NamedTuple):
@@ -187,7 +187,7 @@ class JointReceiver(LockinReceiver):
             length=settings.window,
             wait=-0.6 / rate_hz,
         )
-        self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
+        self._begin(waveform, imu, grid, MIN_SHARE, clips=True)
 
     @cached_property
     def frequencies_hz(self) -> Array:

@@ -33,8 +33,8 @@ from magfusion.receiver.turn import (
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import AnyArray, Array, BoolArray, ComplexArray, IntArray
 
-MOST_COMPARED = 50  # windows by which two clocks are compared
-LEAST_COMPARED = 0.8  # of the samples of the fullest
+MAX_COMPARED = 50  # windows by which two clocks are compared
+MIN_COMPARED_SHARE = 0.8  # of the samples of the fullest
 AT_ONCE = 1 << 14  # samples rotated at once, so that they fit the CPU cache
 UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, in gaps of the gyro
 
@@ -266,10 +266,10 @@ def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
     waveform, half = log.waveform, 0.5 * settings.window
     assert waveform is not None
     first, last = waveform.time[0] + half, waveform.time[-1] - half
-    centre = np.linspace(first, max(first, last), MOST_COMPARED)
+    centre = np.linspace(first, max(first, last), MAX_COMPARED)
     begin = np.searchsorted(waveform.time, centre - half)
     count = np.searchsorted(waveform.time, centre + half) - begin
-    rows = count > LEAST_COMPARED * np.max(count)
+    rows = count > MIN_COMPARED_SHARE * np.max(count)
     length = np.full(len(centre), settings.window)
     number = np.arange(len(centre))
     windows = Windows(number, centre, begin, count, length, np.zeros_like(number)).rows(rows)

@@ -19,7 +19,7 @@ from magfusion.receiver.turn import BodyTurn
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST_SHARE = 0.5  # of the samples of a window: its design shows whether they suffice
+MIN_SHARE = 0.5  # of the samples of a window: its design shows whether they suffice
 
 
 class LockinReceiver(Receiver):
@@ -77,7 +77,7 @@ class LockinReceiver(Receiver):
             length=window,
             wait=-0.6 / rate_hz,  # the last sample is half a step earlier
         )
-        self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
+        self._begin(waveform, imu, grid, MIN_SHARE, clips=True)
 
     def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
         """Return windows and phasors as `Receiver.whole`, each phasor of one beacon."""

@@ -10,12 +10,12 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.cycles import cycles
-from magfusion.receiver.marked_bursts import LATE, LONGEST_BURST, Bursts
+from magfusion.receiver.marked_bursts import LATE, MAX_BURST, Bursts
 from magfusion.receiver.slot_phasors import SlotValues
-from magfusion.receiver.slot_receiver import LEAST_SHARE_OF_SLOT, SlotReceiver
+from magfusion.receiver.slot_receiver import MIN_SHARE_OF_SLOT, SlotReceiver
 from magfusion.receiver.slots import (
-    LEAST_CYCLES,
-    LEAST_SAMPLES,
+    MIN_CYCLES,
+    MIN_SAMPLES,
     SlotSettings,
     carriers_hz,
     check_kept,
@@ -54,7 +54,7 @@ class MarkedReceiver(SlotReceiver):
     @property
     def history(self) -> float:
         """As of `Receiver.history`."""
-        return 0.0 if self.grid is None else MEMORY + MAX_WAIT + LONGEST_BURST
+        return 0.0 if self.grid is None else MEMORY + MAX_WAIT + MAX_BURST
 
     @property
     def marks(self) -> Marks | None:
@@ -98,7 +98,7 @@ class MarkedReceiver(SlotReceiver):
         self.next_number = self.bursts.first_after(float(waveform.time[0]) - LATE / rate_hz)
         # The plateau of a pulse is not saturation.
         clips = not is_pulsed(self.site)
-        self._begin(waveform, imu, WindowGrid(0.0, 0.0, 0.0), LEAST_SHARE_OF_SLOT, clips=clips)
+        self._begin(waveform, imu, WindowGrid(0.0, 0.0, 0.0), MIN_SHARE_OF_SLOT, clips=clips)
         assert self.admission is not None
         self.admission.slack = 1
 
@@ -115,7 +115,7 @@ class MarkedReceiver(SlotReceiver):
         """Omit also the bursts that are too short for their tone, as `Receiver.admit`."""
         result = super().admit(waveform, imu, until)
         turns = result.length * carriers_hz(self.site, places(self.site))[result.place]
-        short = (turns < LEAST_CYCLES) & (turns > 0.0) | (result.count < LEAST_SAMPLES)
+        short = (turns < MIN_CYCLES) & (turns > 0.0) | (result.count < MIN_SAMPLES)
         self._count(TOO_SHORT, int(np.sum(short)))
         return result.rows(~short)
 

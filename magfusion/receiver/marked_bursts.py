@@ -10,8 +10,8 @@ from magfusion.units import Array, IntArray
 
 # s; from the first to the last slot of an epoch. In half that time a head accelerated by
 # 10 m/s^2 deviates by 0.2 mm from constant velocity.
-LONGEST_EPOCH = 0.012
-LONGEST_BURST = 1.0  # s; longer ones are split
+MAX_EPOCH = 0.012
+MAX_BURST = 1.0  # s; longer ones are split
 OVERLAP = 1e-6  # s; tolerance for rounding
 LATE = 0.6  # steps before a burst's end, after which no sample of it comes
 
@@ -19,11 +19,11 @@ LATE = 0.6  # steps before a burst's end, after which no sample of it comes
 class Bursts:
     """Bursts with their running numbers and epochs.
 
-    A repeated coil begins a new epoch, as does a burst more than `LONGEST_EPOCH` after the first.
+    A repeated coil begins a new epoch, as does a burst more than `MAX_EPOCH` after the first.
     """
 
     # What a checkpoint holds.
-    marks: Marks  # stored bursts, split to at most `LONGEST_BURST`
+    marks: Marks  # stored bursts, split to at most `MAX_BURST`
     first: int  # number of the first of these
     column: SlotColumn  # slots given per sample
     _epoch: IntArray
@@ -85,7 +85,7 @@ class Bursts:
         if (
             not self._epoch_bursts
             or slot in self._epoch_bursts
-            or centre - self._epoch_start > LONGEST_EPOCH
+            or centre - self._epoch_start > MAX_EPOCH
         ):
             self._newest, self._epoch_bursts, self._epoch_start = (
                 self._newest + 1,
@@ -104,7 +104,7 @@ class Bursts:
         """Return the middle of a burst (s); of a future one, its earliest begin."""
         row = number - self.first
         if row < 0:
-            return float(self.marks.begin[0]) - LONGEST_BURST if len(self) else -np.inf
+            return float(self.marks.begin[0]) - MAX_BURST if len(self) else -np.inf
         return float(_centres(self.marks)[row]) if row < len(self) else self._end
 
     def epochs(self, number: IntArray) -> IntArray:
@@ -151,12 +151,12 @@ def _centres(marks: Marks) -> Array:
 
 
 def _in_pieces(marks: Marks) -> Marks:
-    """Split bursts so that none is longer than `LONGEST_BURST`."""
+    """Split bursts so that none is longer than `MAX_BURST`."""
     length = marks.end - marks.begin
-    pieces = np.maximum(np.ceil(length / LONGEST_BURST - 1e-9), 1.0).astype(np.int64)
+    pieces = np.maximum(np.ceil(length / MAX_BURST - 1e-9), 1.0).astype(np.int64)
     if np.all(pieces == 1):
         return marks
     row = np.repeat(np.arange(len(marks)), pieces)
     place = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    begin = marks.begin[row] + LONGEST_BURST * place
-    return Marks(begin, np.minimum(begin + LONGEST_BURST, marks.end[row]), marks.slot[row])
+    begin = marks.begin[row] + MAX_BURST * place
+    return Marks(begin, np.minimum(begin + MAX_BURST, marks.end[row]), marks.slot[row])

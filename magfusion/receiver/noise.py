@@ -7,8 +7,8 @@ import numpy as np
 from magfusion.units import Array, BoolArray, IntArray
 
 MIN_RESIDUAL_SHARE = 1e-6  # least share of a probe outside the design for its residual to count
-LEAST_SHARE = 0.1  # of the declared noise; constant and coarse samples may show none
-LEAST_NOISE = 1e-18  # T; rounding of the Earth's field
+MIN_SHARE = 0.1  # of the declared noise; constant and coarse samples may show none
+MIN_NOISE = 1e-18  # T; rounding of the Earth's field
 
 
 def _probe_frequencies(
@@ -84,7 +84,7 @@ def not_below(noise_cov: Array, sigma: float) -> Array:
 
     Repeated and coarsely quantised samples may be constant all through a window.
     """
-    least = max(LEAST_SHARE * sigma, LEAST_NOISE) ** 2
+    least = max(MIN_SHARE * sigma, MIN_NOISE) ** 2
     # The two larger eigenvalues have at most the product of half their sum squared.
     half = 0.5 * np.einsum("...ii->...", noise_cov)
     if (np.linalg.det(noise_cov) > least * half**2).all():

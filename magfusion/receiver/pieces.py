@@ -14,7 +14,7 @@ from magfusion.receiver.hum import Hum
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 64  # pieces at once
-LEAST_SHARE = 0.9  # of the samples of a piece
+MIN_SHARE = 0.9  # of the samples of a piece
 OUTLIER_RATIO = 4.5  # times the median residual; exceeded by noise once in 10^10
 MAX_OUTLIER_SHARE, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are rejected
 NO_PROBES = np.zeros(0)
@@ -66,7 +66,7 @@ def pieces(
     centre = np.asarray(span[0] - 0.5 * step + 0.5 * length * np.arange(1.0, count + 1.0))
     first = np.searchsorted(time, centre - 0.5 * length)
     fixed = np.searchsorted(time, centre + 0.5 * length) - first
-    whole = fixed * step >= LEAST_SHARE * length
+    whole = fixed * step >= MIN_SHARE * length
     centre, first, fixed = centre[whole], first[whole], fixed[whole]
     result = [
         _fitted(

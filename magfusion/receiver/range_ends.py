@@ -13,8 +13,8 @@ from magfusion.files.plausible import reaches
 from magfusion.model.samples import Waveform
 from magfusion.units import Array, BoolArray, IntArray
 
-SHORTEST = 3  # samples in a row at the end of a range
-LONGEST = 8  # length of a run that is an end of range, whatever repeats elsewhere
+MIN_RUN = 3  # samples in a row at the end of a range
+MAX_RUN = 8  # length of a run that is an end of range, whatever repeats elsewhere
 STEPS = 8.0  # of the instrument, that a range must have before its end is reached
 
 
@@ -26,7 +26,7 @@ class RangeEnds:
     low: float = np.inf
     high: float = -np.inf
     finest: float = np.inf  # smallest change from one sample to the next (T)
-    # longest run of a constant value that was no extreme (samples); at most `LONGEST`
+    # longest run of a constant value that was no extreme (samples); at most `MAX_RUN`
     kept: int = 0
     until: float = -np.inf  # time of the last sample used (s)
 
@@ -76,7 +76,7 @@ def saturated(
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
     # The ends cover the earlier samples, except the length of the newest run.
     new = int(np.searchsorted(waveform.time[fresh], min(one.until for one in ends), side="right"))
-    known_until = max(min(new, int(begin.min())) - LONGEST, 0)
+    known_until = max(min(new, int(begin.min())) - MAX_RUN, 0)
     fresh, begin, end = fresh[known_until:], begin - known_until, end - known_until
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
@@ -94,9 +94,9 @@ def saturated(
     start = np.maximum.accumulate(np.where(moved, index, 0))
     inner = (value > low) & (value < high)
     inner &= time[:, None] > np.array([one.until for one in ends])
-    length = np.minimum(index - start + 1, LONGEST)
+    length = np.minimum(index - start + 1, MAX_RUN)
     kept = np.maximum(np.maximum.accumulate(np.where(inner, length, 0)), known[3])
-    for axis in np.flatnonzero(np.max(length, axis=0) >= SHORTEST).tolist():
+    for axis in np.flatnonzero(np.max(length, axis=0) >= MIN_RUN).tolist():
         runs = _Runs(*(part[:, axis] for part in (value, low, high, finest, start, kept)))
         corrupted |= _at_end(runs, begin, end)
     newest = float(time[-1])
@@ -136,14 +136,14 @@ def _at_end(runs: _Runs, begin: IntArray, end: IntArray) -> BoolArray:
     first = np.flatnonzero(start == np.arange(len(value)))
     stop = np.append(first[1:], len(value))
     extreme = (value[first] == low[stop - 1]) | (value[first] == high[stop - 1])
-    long = (stop - first >= SHORTEST) & extreme
+    long = (stop - first >= MIN_RUN) & extreme
     first, stop = first[long], stop[long]
     from_run, to_run = np.searchsorted(stop, begin, side="right"), np.searchsorted(first, end)
     for k in np.flatnonzero((to_run > from_run) & (end > begin)):
         at, within = end[k] - 1, slice(from_run[k], to_run[k])
         if high[at] - low[at] <= STEPS * finest[at]:
             continue
-        least = max(SHORTEST, min(int(kept[at]) + 1, LONGEST))
+        least = max(MIN_RUN, min(int(kept[at]) + 1, MAX_RUN))
         whole = np.minimum(stop[within], end[k]) - np.maximum(first[within], begin[k])
         own = value[first[within]]
         result[k] = bool(np.any((whole >= least) & ((own == low[at]) | (own == high[at]))))

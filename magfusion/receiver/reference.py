@@ -15,10 +15,10 @@ from magfusion.model.samples import Waveform
 from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-LARGEST_LAG = 5.0  # s; of the reference's clock
+MAX_LAG = 5.0  # s; of the reference's clock
 BLOCK = 40.96  # s; in which lag and rate of the clock are estimated
 CLEAR_HZ = 0.6  # excluded about tones and mains, which correlate at any lag of whole turns
-LEAST_PEAK = 8.0  # times the scatter of the correlation, for a lag
+MIN_PEAK = 8.0  # times the scatter of the correlation, for a lag
 FINER = 8  # lags in a sampling step
 NEAR_LAG = 8  # samples about the common lag, in which blocks find their own
 PROBES = 8  # probes about a tone
@@ -70,7 +70,7 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     own = result[:, first : best + NEAR_LAG * FINER + 1]
     near = lags[first : first + own.shape[1]]
     peak = np.clip(np.argmax(own, axis=1), 1, own.shape[1] - 2)
-    clear = own[np.arange(len(own)), peak] > np.median(mean) + LEAST_PEAK * _scatter(mean)
+    clear = own[np.arange(len(own)), peak] > np.median(mean) + MIN_PEAK * _scatter(mean)
     middle = waveform.time[starts] + 0.5 * BLOCK
     if np.sum(clear) < 3:
         return Lag(float(lags[best]) * step, 0.0)
@@ -103,13 +103,13 @@ def common_noise(
     other, there = reference_at(waveform, reference, NO_LAG)
     if not len(starts) or not np.any(there):
         return None
-    reach = int(LARGEST_LAG / step) * FINER
+    reach = int(MAX_LAG / step) * FINER
     lags = np.arange(-reach, reach + 1)
     pairs = ((waveform.measured_sensor[k : k + size], other[k : k + size]) for k in starts)
     power = np.stack([_correlation(*pair, step, lines_hz)[lags] for pair in pairs])
     mean = np.mean(power, axis=0)
     best = int(np.argmax(mean))
-    if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
+    if mean[best] - np.median(mean) < MIN_PEAK * _scatter(mean):
         return None
     return power, starts, mean, best, lags
 

@@ -12,8 +12,8 @@ from magfusion.model.samples import FieldSamples, Waveform
 from magfusion.model.site import Beacon, Site
 from magfusion.units import AnyArray, Array
 
-LEAST_SAMPLES = 0.8  # of a whole window
-LEAST_TURNS = 4.0  # in a window
+MIN_SAMPLES = 0.8  # of a whole window
+MIN_TURNS = 4.0  # in a window
 PROBE_TURNS = (3.0, 4.0, 5.0, 6.0)  # offset of the probes from a tone (turns in a window)
 POOLED = 4  # windows on either side with which noise is averaged
 MAINS = 3  # number of harmonics
@@ -50,13 +50,13 @@ def demodulate_rotor(
     for first in edges:
         rows = slice(*np.searchsorted(time, [first, first + window]))
         known = np.isfinite(angle[rows])
-        if np.sum(known) < LEAST_SAMPLES * window / step:
+        if np.sum(known) < MIN_SAMPLES * window / step:
             continue
         own, rotated = time[rows][known], angle[rows][known]
-        if np.max(np.diff(own)) > (1.0 - LEAST_SAMPLES) * window:
+        if np.max(np.diff(own)) > (1.0 - MIN_SAMPLES) * window:
             continue
         turns = abs(rotated[-1] - rotated[0]) / (2.0 * np.pi)
-        if turns < LEAST_TURNS or turns > 0.4 * len(own) / max(orders):
+        if turns < MIN_TURNS or turns > 0.4 * len(own) / max(orders):
             continue
         result = _of_window(
             own - first - 0.5 * window, rotated, calm[rows][known], orders, mains_hz

@@ -20,8 +20,8 @@ PER_WIDTH = 8.0  # speeds per inverse length of a piece
 BEYOND = np.array([3.0, 4.0, 5.0, 6.0])  # over a piece's length, beyond the search: noise alone
 ABOUT = 4  # pieces on either side that share a polarisation
 MAX_ITERATIONS = 6
-LEAST_SNR = 3.0  # of the median piece; below, the magnet is not detected
-MOST_SPEEDS = 2000
+MIN_SNR = 3.0  # of the median piece; below, the magnet is not detected
+MAX_SPEEDS = 2000
 
 
 def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Array:
@@ -40,13 +40,13 @@ def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Arr
     field = waveform.measured_sensor - _slow(waveform, piece)
     low = max(frequency_hz - REACH * rotor.speed_sigma_hz, 2.0 / piece)
     high = frequency_hz + REACH * rotor.speed_sigma_hz
-    count = min(int(np.ceil((high - low) * piece * PER_WIDTH)) + 1, MOST_SPEEDS)
+    count = min(int(np.ceil((high - low) * piece * PER_WIDTH)) + 1, MAX_SPEEDS)
     speeds = np.linspace(low, high, max(count, 3))
     power = _powers(time, field, centres, piece, speeds)
     noise = float(np.mean(_powers(time, field, centres, piece, high + BEYOND / piece)))
     most_probable = _course(power / noise, speeds, rotor.speed_walk_hz_rts * np.sqrt(half))
     snr = np.median(power[np.arange(len(centres)), most_probable] / noise)
-    if snr < LEAST_SNR**2:
+    if snr < MIN_SNR**2:
         raise InputError(
             f"a magnet that rotates at {frequency_hz:g} Hz within {high - frequency_hz:.2g} is not"
             " detected above the noise; record its angle, or check its frequency_hz and"

@@ -9,7 +9,7 @@ import numpy as np
 
 from magfusion.model.batches import PAUSE, spread_batches
 from magfusion.receiver.bursts import (
-    LONGEST,
+    MAX_PAUSE,
     SHARE,
     TOGETHER,
     burst_ends,
@@ -33,7 +33,7 @@ MIN_POINTS = 4  # batches
 REFIT = 0.1  # s between two fits
 UNDECIDED = 30  # samples
 CLEAR = 0.25  # of a step, root mean square; beyond, the ticks of the first samples are not certain
-LEAST_ADVANCE = 0.5  # of a step, where the clock is set back
+MIN_ADVANCE = 0.5  # of a step, where the clock is set back
 
 
 Stamping = Literal["stamps", "counted", "rounded"]
@@ -145,7 +145,7 @@ class RunningClock:
             return stamps
         self._watched, self._rounding = None, resolution
         time = self._start("rounded", seen, clock.time, np.arange(len(seen)))[-len(stamps) :]
-        least = before + LEAST_ADVANCE * self.step * np.arange(1, len(time) + 1)
+        least = before + MIN_ADVANCE * self.step * np.arange(1, len(time) + 1)
         time = np.maximum(time, least)
         self._newest = float(time[-1])
         return np.asarray(time)
@@ -161,7 +161,7 @@ class RunningClock:
             tick = np.cumsum(np.append(0.0, np.maximum(np.rint(np.diff(time) / step), 1.0)))
         else:
             between = float(np.median(np.diff(stamps[last])))
-            self._pause, last = max(PAUSE * between, LONGEST), last[:-1]
+            self._pause, last = max(PAUSE * between, MAX_PAUSE), last[:-1]
         self._tick, self._stamp = int(tick[-1]), float(stamps[-1])
         self._points = np.stack([tick[last], stamps[last]])
         self._fit()
@@ -185,7 +185,7 @@ class RunningClock:
         self._tick, self._stamp = int(tick[-1]), float(stamps[-1])
         if self._stamp > self._fitted + REFIT:
             self._fit()
-        least = self._newest + LEAST_ADVANCE * self.step * np.arange(1, len(before))
+        least = self._newest + MIN_ADVANCE * self.step * np.arange(1, len(before))
         result = np.maximum(self._origin + self.step * tick[1:], least)
         self._newest = float(result[-1])
         return np.asarray(result)

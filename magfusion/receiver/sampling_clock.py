@@ -10,21 +10,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
-from magfusion.receiver.bursts import LONGEST, spread_bursts
+from magfusion.receiver.bursts import MAX_PAUSE, spread_bursts
 from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
-MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks are not separable
+MAX_SCATTER = 0.45  # of a step, root mean square; beyond, ticks are not separable
 PIECE = 200  # samples assigned to ticks at once
 KEPT = 150  # of them: those at the end may belong to another tick
-MOST_LOST = 40  # ticks in a piece, unless more are seen to be; a longer silence is a gap
+MAX_LOST = 40  # ticks in a piece, unless more are seen to be; a longer silence is a gap
 GAP = 10.0  # steps
 LOSS = 8.0  # log-likelihood ratio that a lost sample costs, where few are lost
-MANY_LOST = 0.05  # of the samples; beyond, a loss costs what this share of losses does
+COSTLY_LOST_SHARE = 0.05  # of the samples; beyond, a loss costs what this share of losses does
 MEMORY = 2000  # samples that predict the next ticks
-MOST_PIECES = 40  # used for the median step
+MAX_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
-MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
+MAX_LOST_SHARE = 0.2  # by which the mean step may be longer
 MAX_DELAY = 32  # steps, by which a host delivers late
 LARGE_JITTER = 0.45  # of a step, standard deviation of steps from which a tick may be mistaken
 OWN_JITTER = 0.7  # correlation of neighbours below which samples are late each by itself; sorting
@@ -38,11 +38,11 @@ STRICT = 0.98  # share of equal periods
 MILLISECONDS = (1e-3, 2.0**-10)  # s, in which most coarse clocks count
 ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
 MAX_ROUNDING_STEPS = 1.2  # resolutions; rounding is half of one, cutting off one
-MOST_STEPS = 10_000  # of which a common divisor is looked for
+MAX_STEPS = 10_000  # of which a common divisor is looked for
 ROUNDING_RMS = 0.29  # resolutions, 1/sqrt(12)
 # Of a step; beyond, a loss and a rounded stamp look alike, and of even stamps with losses the step
 # itself divides all.
-MOST_ROUNDING = 0.12
+MAX_ROUNDING_SHARE = 0.12
 MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
 
 
@@ -76,15 +76,15 @@ def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
 def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
     """Return the clock of samples that arrive in bursts: without losses, they are counted."""
     steps = np.diff(separate)
-    step = float(np.mean(steps[steps < LONGEST]))
-    breaks = np.flatnonzero(steps >= LONGEST) + 1
+    step = float(np.mean(steps[steps < MAX_PAUSE]))
+    breaks = np.flatnonzero(steps >= MAX_PAUSE) + 1
     parts = np.split(separate, breaks)
     time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
     # A lost sample shifts the later ones by a step.
     if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_DELAY * step:
         time = separate
     steps = np.diff(time)
-    step = float(np.mean(steps[steps < LONGEST]))
+    step = float(np.mean(steps[steps < MAX_PAUSE]))
     return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
@@ -93,7 +93,7 @@ def stamp_resolution(stamps: Array) -> float:
     if len(stamps) < 2:
         return 0.0
     exact = 4.0 * max(NANOSECOND, float(np.spacing(np.max(np.abs(stamps)))))
-    steps = np.sort(np.diff(stamps[:MOST_STEPS]))
+    steps = np.sort(np.diff(stamps[:MAX_STEPS]))
     change = np.diff(steps, prepend=0.0)
     separate = change[change > exact]
     while len(separate) and (least := float(np.min(separate))) > 10.0 * exact:
@@ -113,7 +113,7 @@ def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
     counted = None if lossy else _counted_step(stamps)
     median = lossy or float(np.median(np.diff(stamps)))
     # Rounded steps are equal for a while, if they are nearly a whole number of resolutions.
-    rounded = EVEN * median < rounding < MOST_ROUNDING * median
+    rounded = EVEN * median < rounding < MAX_ROUNDING_SHARE * median
     if counted is None and not rounded and is_even(stamps, median):
         return None
     step = counted or _usual_step(stamps, median)
@@ -125,7 +125,7 @@ def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
     parts = [_of_stretch(part, step, floor) for part in np.split(stamps, breaks)]
     off = np.concatenate([p.time for p in parts]) - stamps
     scatter = float(np.sqrt(np.mean(off**2)))
-    if not EVEN * step < scatter < MOST_SCATTER * step:
+    if not EVEN * step < scatter < MAX_SCATTER * step:
         return None
     time = np.concatenate([p.time for p in parts])
     if np.any(np.diff(time) <= 0.0):
@@ -231,9 +231,9 @@ def _usual_step(stamps: Array, median: float) -> float:
     steps = np.diff(stamps)
     mean = float(np.mean(steps[steps <= GAP * median]))
     count = len(stamps) // PIECE
-    pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MOST_PIECES]
+    pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MAX_PIECES]
     near = np.linspace(-SEARCHED, SEARCHED, 161)
-    losing = np.linspace(-MOST_LOST_SHARE, SEARCHED, 281)
+    losing = np.linspace(-MAX_LOST_SHARE, SEARCHED, 281)
     tried = np.concatenate([median * (1.0 + near), mean * (1.0 + losing)])
     for width in (0.1 * SEARCHED, 0.01 * SEARCHED, 0.0):
         kept = [float(np.sum(np.abs(_phasor(pieces, step)) ** 2)) for step in tried]
@@ -294,8 +294,8 @@ def lost_ticks(late: Array, sigma: float) -> IntArray:
     """
     if np.max(np.abs(late)) < 0.5:
         return np.zeros(len(late), dtype=np.int64)
-    lost_epochs = np.arange(max(MOST_LOST, int(np.max(late)) + 2) + 1)
-    loss = -np.log(MANY_LOST) if late[-1] > MANY_LOST * len(late) else LOSS
+    lost_epochs = np.arange(max(MAX_LOST, int(np.max(late)) + 2) + 1)
+    loss = -np.log(COSTLY_LOST_SHARE) if late[-1] > COSTLY_LOST_SHARE * len(late) else LOSS
     cost = np.where(lost_epochs == 0, 0.0, loss)
     came = np.zeros((len(late), len(lost_epochs)), dtype=np.int64)
     for k, own in enumerate(late):

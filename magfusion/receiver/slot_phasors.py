@@ -30,7 +30,7 @@ from magfusion.receiver.slots import (
 from magfusion.receiver.turn import Turn
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-LONGEST_PAUSE = 1.0  # s; longer pauses separate the noise of marked bursts
+MAX_PAUSE = 1.0  # s; longer pauses separate the noise of marked bursts
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def _hum(
     """Return the covariance of each silent burst that its neighbours do not predict."""
     own = silent.variance[:, None, None] * noise
     state = settings.cycles, settings.mains_hz
-    spread = LONGEST_PAUSE, NOISE_CYCLES * places(site)
+    spread = MAX_PAUSE, NOISE_CYCLES * places(site)
     return left_by_ambient(silent.time, silent.length, still, own, state, spread)
 
 
@@ -292,7 +292,7 @@ def _smoothed_noise(
     """Return the covariance per sample averaged over many cycles, (n, 3, 3), non-rotating axes."""
     cov = still_from_measured @ values.noise @ np.swapaxes(still_from_measured, 1, 2)
     number = NOISE_CYCLES * places(site)
-    cycle = LONGEST_PAUSE if is_marked(site) else schedule(site).cycle
+    cycle = MAX_PAUSE if is_marked(site) else schedule(site).cycle
     smooth = smoothed_over_windows(cov[:, None], values.centre, cycle, number, None)[:, 0]
     least = 1e-12 * float(np.abs(still).max())
     return smooth + least**2 * np.eye(3)

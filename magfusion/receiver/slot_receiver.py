@@ -31,7 +31,7 @@ from magfusion.receiver.turn import Turn, slot_turn_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST_SHARE_OF_SLOT = 0.9  # of the samples of a slot, which has few columns
+MIN_SHARE_OF_SLOT = 0.9  # of the samples of a slot, which has few columns
 FOLLOWED_EVERY = 0.2  # s; clocks that are 100 ppm apart drift by 20 us
 
 
@@ -89,7 +89,7 @@ class SlotReceiver(Receiver):
         self.next_number = int(np.ceil(elapsed / slots.duration + ROUNDING))
         # The plateau of a pulse is not saturation.
         clips = not is_pulsed(self.site)
-        self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=clips)
+        self._begin(waveform, imu, grid, MIN_SHARE_OF_SLOT, clips=clips)
 
     def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
         """Track searched slots through a whole log, as through a stream."""

@@ -16,7 +16,7 @@ from magfusion.units import AnyArray, Array
 BINS = 32  # of a slot
 MIN_BINS = 6  # of them with samples; a slot has eight
 MIN_CYCLES = 4
-LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
+MAX_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
 STEADY_CYCLES = 4  # of the carrier, over which the mean is the static field
 MAX_SILENT_LEVEL = 0.4  # of the weakest driven slot
 
@@ -52,7 +52,7 @@ def check_timing_declared(site: Site) -> None:
 
 def informative_share(slots: Slots) -> float:
     """Return the length of stream needed to estimate the begin of a cycle (s)."""
-    return max(LONGEST_FOLD, 2.0 * MIN_CYCLES * slots.cycle)
+    return max(MAX_FOLD, 2.0 * MIN_CYCLES * slots.cycle)
 
 
 def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:

@@ -12,8 +12,8 @@ from magfusion.receiver.ambient import STRETCH, Removal
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot from the carrier
-LEAST_CYCLES = 1.0  # of a carrier in a slot
+MIN_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot from the carrier
+MIN_CYCLES = 1.0  # of a carrier in a slot
 NOISE_CYCLES = 16  # over which the noise is averaged
 
 
@@ -164,10 +164,10 @@ def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
     """Reject slots and carriers that the sampling rate or the settings do not suit."""
     slots = schedule(site)
     carrier = carriers_hz(site, slots.count)
-    if slots.duration * rate_hz < LEAST_SAMPLES * (1.0 - 1e-6):
+    if slots.duration * rate_hz < MIN_SAMPLES * (1.0 - 1e-6):
         raise InputError(
             f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for slots of"
-            f" {slots.duration:g} s; at least {LEAST_SAMPLES / slots.duration:.4g} Hz are needed"
+            f" {slots.duration:g} s; at least {MIN_SAMPLES / slots.duration:.4g} Hz are needed"
         )
     highest, lowest = float(np.max(carrier)), float(np.min(carrier))
     if highest > 0.45 * rate_hz:
@@ -175,9 +175,9 @@ def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
             f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the carrier at {highest:g}"
             f" Hz; at least {highest / 0.45:.4g} Hz are needed"
         )
-    if highest > 0.0 and lowest * slots.duration < LEAST_CYCLES:
+    if highest > 0.0 and lowest * slots.duration < MIN_CYCLES:
         raise InputError(
-            f"a carrier of {lowest:g} Hz has less than {LEAST_CYCLES:g} cycles in a slot of"
+            f"a carrier of {lowest:g} Hz has less than {MIN_CYCLES:g} cycles in a slot of"
             f" {slots.duration:g} s; give longer slots, a faster carrier, or frequency_hz: 0"
             " in all coils for pulses of direct current"
         )

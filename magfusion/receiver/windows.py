@@ -9,9 +9,9 @@ from magfusion.model.detection_range import mutually_undetectable, phasor_sigma,
 from magfusion.model.site import Beacon, Site
 from magfusion.units import Array
 
-LONGEST_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
+MAX_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
 EVEN = 1e-6  # steps; less is rounding of stamps
-CLOSEST_TONES_HZ = 2.0 / LONGEST_WINDOW
+CLOSEST_TONES_HZ = 2.0 / MAX_WINDOW
 AGAIN_WINDOW = 1.0  # s; in which beacons sharing a frequency must not be received together
 
 
@@ -53,7 +53,7 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
         order = np.maximum(np.round(frequencies / mains_hz), 1.0)
         to_mains = np.abs(frequencies - order * mains_hz)
         spacing = min(spacing, float(np.min(to_mains[to_mains > 0.5], initial=np.inf)))
-    window = float(np.clip(2.0 / spacing, 0.02, LONGEST_WINDOW))
+    window = float(np.clip(2.0 / spacing, 0.02, MAX_WINDOW))
     return LockinSettings(window=window, step=window / 2.0, mains_hz=mains_hz)
 
 

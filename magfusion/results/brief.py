@@ -23,7 +23,7 @@ from magfusion.results.verdict import look_of
 Rows = list[list[str]]
 # Remarks that require no action.
 _ROUTINE = {"noise_tuned"}
-MOST_NAMED = 2  # fixed parameters
+MAX_LISTED = 2  # fixed parameters
 _MATTERS = 0.5  # of the sigma of a pose; smaller effects of fixed parameters are only counted
 # Criteria of stability, where the key is no term of a navigator.
 _CRITERIA = {"carried": "error between fields", "lost": "tracking without loss"}
@@ -152,7 +152,7 @@ def _unverified(figures: Figures) -> str:
         for one in rows
     }
     rows.sort(key=lambda one: -effect[str(one["parameter"])])
-    matters = [one for one in rows[:MOST_NAMED] if effect[str(one["parameter"])] > _MATTERS]
+    matters = [one for one in rows[:MAX_LISTED] if effect[str(one["parameter"])] > _MATTERS]
     words = [
         f"{one['parameter']} (± {one['sigma']} moves poses by {length(float(one['position_m']))},"
         f" {number_text(one['rotation_deg'], 2)} deg)"

@@ -18,7 +18,7 @@ from magfusion.units import Array, IntArray
 STEP = 0.01  # of a variance, for its derivative
 NEGLIGIBLE = 1e-4  # of a sigma: weights need some noise
 DOMINANT = 0.5  # share of the variance, from which a source limits alone
-FEW_BEACONS = 3  # in range; with fewer the geometry limits
+MIN_BEACONS = 3  # in range; with fewer the geometry limits
 ELONGATED = 3.0  # worst over median sigma, from which the geometry limits
 
 
@@ -131,7 +131,7 @@ def limiting(budget: ErrorBudget, row: int, beacons: IntArray) -> str:
     first = budget.sources[order[0]]
     x, y, z = budget.position_world[row]
     where = f"At ({x:.3g}, {y:.3g}, {z:.3g}) m, where the position is least certain,"
-    if beacons[row] < FEW_BEACONS or budget.sigma[row] > ELONGATED * np.median(budget.sigma):
+    if beacons[row] < MIN_BEACONS or budget.sigma[row] > ELONGATED * np.median(budget.sigma):
         return (
             f"{where} the geometry limits: {beacons[row]} beacons are in range, and {first} has"
             f" {100.0 * share[order[0]]:.0f} % of the variance. Place a beacon near it."

@@ -23,8 +23,8 @@ from magfusion.units import DEGREE, Array, BoolArray
 
 HARDLY_TURNED = 15.0  # deg, root mean square about an axis
 HARDLY_MOVED = 0.5  # m, between the extremes
-FEW_RESTS = 0.01  # of the time
-MOST_NAMED = 3
+MIN_REST_SHARE = 0.01  # of the time
+MAX_LISTED = 3
 _AXES = "xyz"
 
 
@@ -80,7 +80,7 @@ def missing_motion(
     open_ = _open(calibration, blocks, coverage)
     out = [_of_beacon(covered, b.name, open_.get(b.name, [])) for b in calibration.site.beacons]
     out += [_of_turning(covered, blocks, coverage), _of_extent(covered, blocks, coverage)]
-    if covered.rest_share < FEW_RESTS:
+    if covered.rest_share < MIN_REST_SHARE:
         out.append(
             "The platform was never stationary: the IMU's biases, and with them the vertical, are"
             " only determined by its motion; add stops of some seconds, in several attitudes."
@@ -116,11 +116,11 @@ def _open(
 def _of_beacon(covered: MotionCoverage, name: str, open_: list[str]) -> str:
     if not open_:
         return ""
-    more = f" and {len(open_) - MOST_NAMED} more" if len(open_) > MOST_NAMED else ""
+    more = f" and {len(open_) - MAX_LISTED} more" if len(open_) > MAX_LISTED else ""
     return (
         f"The platform was never closer than {covered.nearest[name]:.1f} m to beacon {name}, within"
         f" {covered.spread_deg[name]:.0f} deg of one direction from it: not determined are"
-        f" {', '.join(open_[:MOST_NAMED])}{more}; pass it closer, and on another side."
+        f" {', '.join(open_[:MAX_LISTED])}{more}; pass it closer, and on another side."
     )
 
 

@@ -19,8 +19,8 @@ from magfusion.units import Array
 WEAKEST = 5  # directions that are put in words
 DEGENERATE_RATIO = 0.95  # ratio from which directions are alike, so that they may be mixed at will
 SHARE_NAMED = 0.08  # of a direction's square, from which a parameter is named
-MOST_NAMED = 4
-SMALLEST_LISTED = 1e-4  # m, rad or relative; a common shift below it is of no interest
+MAX_LISTED = 4
+MIN_LISTED = 1e-4  # m, rad or relative; a common shift below it is of no interest
 
 
 class Weakness(NamedTuple):
@@ -117,7 +117,7 @@ def _open_gauge(
             continue
         columns.append(column)
         amplitude = ratio / length
-        if amplitude > SMALLEST_LISTED:
+        if amplitude > MIN_LISTED:
             unit, scale = gauge.unit
             words = f"{gauge.name} by {amplitude / scale:.2g} {unit}: {gauge.remedy}"
             listed = known if gauge.exact else nearly
@@ -191,7 +191,7 @@ def _in_words(
             words = f"the moments of beacon {block.owner}"
             parts[block.columns] = [(share, mean, words, *LOG_MOMENT.display_unit)]
     parts.sort(key=lambda part: -part[0])
-    named = [part for part in parts[:MOST_NAMED] if part[0] > SHARE_NAMED] or parts[:1]
+    named = [part for part in parts[:MAX_LISTED] if part[0] > SHARE_NAMED] or parts[:1]
     sign = np.sign(named[0][1]) or 1.0
     texts = [f"{name} by {sign * size / scale:+.2g} {unit}" for _, size, name, unit, scale in named]
     listed = texts[0] if len(texts) == 1 else f"{texts[0]} against {', '.join(texts[1:])}"

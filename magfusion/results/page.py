@@ -34,7 +34,7 @@ from magfusion.results.shown import (
 from magfusion.results.verdict import look_of
 
 PAGE = "report.html"
-LARGEST = 4_500_000  # bytes, of which a mail takes one
+MAX_BYTES = 4_500_000  # bytes, of which a mail takes one
 FAR = 3.0  # sigmas; a change beyond is marked
 _MEANING = {
     "trustworthy": "The data are consistent; the reported accuracy is valid.",
@@ -90,7 +90,7 @@ def write_page(directory: Path, figures: Figures, motion: MotionPage | None = No
         _section("Command, inputs and versions", _how(current_run())),
         _section("All figures of report.json", _all(figures)),
     ]
-    room = LARGEST - sum(len(block.encode()) for block in (*blocks, *after, STYLE))
+    room = MAX_BYTES - sum(len(block.encode()) for block in (*blocks, *after, STYLE))
     blocks.append(_section("Pictures", _pictures(directory, room)))
     text = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'

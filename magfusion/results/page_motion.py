@@ -14,7 +14,7 @@ from magfusion.results.plots.chart import Chart, ChartBand, ChartLine, ChartMark
 from magfusion.units import DEGREE, Array
 
 TIME = "time (s)"
-MOST_BEACONS = 24  # with a chart of residuals of their own
+MAX_BEACONS = 24  # with a chart of residuals of their own
 _FAR = 3.0  # of the path's size; beyond, a beacon would hide the path
 _GAP = 10.0  # times the usual step; a line across it would invent states
 
@@ -86,7 +86,7 @@ def residual_section(motion: MotionPage) -> str:
         3.0, 1.3 * _upper_percentile(np.concatenate([rms for _, rms in result.values()]), 99.5)
     )
     charts = []
-    for title, (time, rms) in list(result.items())[:MOST_BEACONS]:
+    for title, (time, rms) in list(result.items())[:MAX_BEACONS]:
         ends = time[[0, -1]]
         lines = (ChartLine(ends, np.ones(2), "", "expected"), ChartLine(time, rms, "", dots=True))
         charts.append(

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from magfusion.files.commit import commit
 
-LARGEST_HASHED = 64 << 20  # bytes; a tenth of a second
-MOST_FILES = 60
+MAX_HASHED = 64 << 20  # bytes; a tenth of a second
+MAX_FILES = 60
 _LIBRARIES = ("numpy", "scipy", "gtsam")
 
 
@@ -74,12 +74,12 @@ def input_files(run: Run) -> list[tuple[str, int, str]]:
     for path in run.inputs:
         own = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
         result += [p for p in own if p.is_file()]
-    return [(str(p), p.stat().st_size, _sha256(p)) for p in result[:MOST_FILES]]
+    return [(str(p), p.stat().st_size, _sha256(p)) for p in result[:MAX_FILES]]
 
 
 def _sha256(path: Path) -> str:
-    if path.stat().st_size > LARGEST_HASHED:
-        return f"not computed (above {LARGEST_HASHED >> 20} MiB)"
+    if path.stat().st_size > MAX_HASHED:
+        return f"not computed (above {MAX_HASHED >> 20} MiB)"
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -60,7 +60,7 @@ from magfusion.results.shapes import (
 from magfusion.units import Array
 
 ELLIPSOIDS = 30  # along the path
-MOST_POSES = 200_000  # of the body
+MAX_POSES = 200_000  # of the body
 COVERAGE = 1e-6  # T, RMS, on the shell drawn around a beacon
 
 _ESTIMATE = (70, 170, 255)
@@ -231,7 +231,7 @@ def _log_beads(recording: rr.RecordingStream, truth: Trajectory, scale: Scale) -
 
 
 def _log_body(recording: rr.RecordingStream, trajectory: Trajectory, scale: Scale) -> None:
-    rows = rows_of(len(trajectory), MOST_POSES)
+    rows = rows_of(len(trajectory), MAX_POSES)
     turn = Rotation.from_matrix(trajectory.world_from_body[rows]).as_quat()
     recording.send_columns(
         "world/estimate/body",

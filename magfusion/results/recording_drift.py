@@ -13,7 +13,7 @@ from magfusion.results.recording_layout import about_zero, layout, plot, readabl
 from magfusion.results.recording_trust import BANNER, banner_text
 from magfusion.units import HOUR, Array
 
-MOST_POINTS = 5000  # of a series
+MAX_POINTS = 5000  # of a series
 _COLOURS = ([220, 60, 60], [60, 160, 60], [60, 90, 220])
 _UPDATE, _MEMORY = "update_ms", "memory_mib"
 _PACE = {_UPDATE: "processor time of an update (ms)", _MEMORY: "memory (MiB)"}
@@ -116,7 +116,7 @@ def _send(
 
 
 def _thinned(count: int) -> slice:
-    return slice(None, None, max(1, -(-count // MOST_POINTS)))
+    return slice(None, None, max(1, -(-count // MAX_POINTS)))
 
 
 def _blueprint(courses: list[EstimatorPlot], banner: tuple[str, str]) -> rrb.Blueprint:

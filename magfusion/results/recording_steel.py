@@ -7,7 +7,7 @@ from magfusion.estimation.integrity.steel_map import SteelMap
 from magfusion.results.figures import Figure, Figures, Section
 
 DRAWN_SIGMAS = 2.0  # sigma; a voxel less certain than this is drawn grey
-LEAST = 0.05  # of the largest polarisability; less is not drawn
+MIN_DRAWN = 0.05  # of the largest polarisability; less is not drawn
 _STEEL, _UNSURE = (235, 120, 60), (140, 140, 140)
 
 
@@ -27,7 +27,7 @@ def steel_figures(steel: SteelMap) -> Figures:
 def log_steel(recording: rr.RecordingStream, steel: SteelMap) -> None:
     """Draw the voxels with steel, each as large as its polarisability: grey where it is unsure."""
     voxels, (size, sigma) = steel.voxels, steel.polarisability
-    drawn = size > LEAST * np.max(size)
+    drawn = size > MIN_DRAWN * np.max(size)
     # A sphere of iron has a polarisability of three times its volume.
     radius = np.cbrt(size[drawn] / (4.0 * np.pi))
     colours = np.where((size > DRAWN_SIGMAS * sigma)[drawn, None], _STEEL, _UNSURE)

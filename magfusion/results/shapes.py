@@ -9,7 +9,7 @@ from magfusion.model.site import Beacon, Coil, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
-SMALLEST = 0.1  # m, of a scene: a tracker's
+MIN_SIZE = 0.1  # m, of a scene: a tracker's
 
 
 class Scale(NamedTuple):
@@ -29,7 +29,7 @@ def scene_scale(site: Site, trajectory: Trajectory) -> Scale:
     """Return the scale of the scene with the beacons and the path."""
     places = np.vstack([trajectory.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
-    size = max(float(np.linalg.norm(high - low)), SMALLEST)
+    size = max(float(np.linalg.norm(high - low)), MIN_SIZE)
     magnification = 1
     if trajectory.pose_cov is not None:
         variance = np.trace(trajectory.pose_cov[:, 3:, 3:], axis1=1, axis2=2)

@@ -17,9 +17,9 @@ from scipy.special import stdtr, stdtrit
 
 from magfusion.units import Array
 
-MOST_BLOCKS = 60  # whose means stand for the series
-TIMES = 10  # correlation times, from half a block to `LONGEST` spans in equal ratios
-LONGEST = 10.0
+MAX_BLOCKS = 60  # whose means stand for the series
+TIMES = 10  # correlation times, from half a block to `MAX_BLOCK` spans in equal ratios
+MAX_BLOCK = 10.0
 WHITE = (0.0, 0.3, 1.0, 3.0, 10.0, 100.0)  # variance, by what the process changes in a block
 _TAILS = (0.975, 0.9995)  # quantiles that Student's distribution takes from the average
 
@@ -51,7 +51,7 @@ def trend(time: Array, value: Array) -> Trend:
     own, fresh = np.eye(len(when)), 1.0 / len(when)
     result = [
         (memory, *_fitted(design, mean, np.exp(-lag / memory) + noise * own))
-        for memory in np.geomspace(0.5 * fresh, LONGEST, TIMES)
+        for memory in np.geomspace(0.5 * fresh, MAX_BLOCK, TIMES)
         for noise in -np.expm1(-fresh / memory) * np.array(WHITE)
     ]
     memory, rate, error, likelihood = np.array(result).T
@@ -68,7 +68,7 @@ def trend(time: Array, value: Array) -> Trend:
 
 def _block_means(time: Array, value: Array) -> tuple[Array, Array]:
     """Return times and means of blocks of equal length, without empty ones."""
-    blocks = min(MOST_BLOCKS, len(time))
+    blocks = min(MAX_BLOCKS, len(time))
     edges = np.linspace(time[0], time[-1], blocks + 1)
     own = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, blocks - 1)
     count = np.bincount(own, minlength=blocks)

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.data_checks.truth import (
-    LEAST_DELAY,
-    LEAST_TURN,
     MAX_DELAY,
+    MIN_DELAY,
+    MIN_ROTATION,
     SPAN,
     attitude_spans,
     quaternion_text,
@@ -18,7 +18,7 @@ from magfusion.results.alignment import MIN_RATE
 from magfusion.results.association import AssociatedPoses
 from magfusion.units import DEGREE, Array, BoolArray
 
-LEAST_ANGLE = 5.0 * DEGREE  # of a frame; surveys and calibrations do better
+MIN_ANGLE = 5.0 * DEGREE  # of a frame; surveys and calibrations do better
 CONVENTION = 15.0 * DEGREE  # from the axes of a convention
 LEVEL = 2.0 * DEGREE  # of the vertical of a world that is turned by yaw alone
 EXPLAINED = 0.3  # of the errors that a constant leaves
@@ -111,7 +111,7 @@ def _delay_text(pairs: AssociatedPoses) -> str:
     error, speed = error - error.mean(axis=0), speed - speed.mean(axis=0)
     delay = float(np.sum(error * speed)) / max(float(np.sum(speed**2)), 1e-12)
     remaining = float(np.sum((error - delay * speed) ** 2))
-    if not LEAST_DELAY < abs(delay) < MAX_DELAY or remaining > EXPLAINED * np.sum(error**2):
+    if not MIN_DELAY < abs(delay) < MAX_DELAY or remaining > EXPLAINED * np.sum(error**2):
         return ""
     return (
         f"The truth's clock is about {1e3 * abs(delay):.0f} ms {'late' if delay > 0.0 else 'early'}"
@@ -147,7 +147,7 @@ def _repeated(values: Array) -> BoolArray:
 def _world_text(pairs: AssociatedPoses) -> str:
     """Return how the world of the truth is turned against that of the estimate."""
     turn = _world_turn(pairs)
-    if turn is None or turn.magnitude() < LEAST_ANGLE:
+    if turn is None or turn.magnitude() < MIN_ANGLE:
         return ""
     up = turn.as_matrix()[:, 2]
     if np.arccos(np.clip(-up[2], -1.0, 1.0)) < CONVENTION:
@@ -185,7 +185,7 @@ def _world_turn(pairs: AssociatedPoses) -> Rotation | None:
 def _body_text(pairs: AssociatedPoses) -> str:
     """Return how the tracked frame is turned against the body."""
     body = _body_turn(pairs)
-    if body is None or body.magnitude() < LEAST_ANGLE:
+    if body is None or body.magnitude() < MIN_ANGLE:
         return ""
     if (body * Rotation.from_matrix(UP_FROM_DOWN)).magnitude() < CONVENTION:
         return (
@@ -210,7 +210,7 @@ def _body_turn(pairs: AssociatedPoses) -> Rotation | None:
     moved, target = (
         (p.rotation[:-step].inv() * p.rotation[step:]).as_rotvec() for p in (own, true)
     )
-    active = np.linalg.norm(moved, axis=1) > LEAST_TURN
+    active = np.linalg.norm(moved, axis=1) > MIN_ROTATION
     if np.sum(active) < MIN_TURNS or _is_flat(moved[active]) or _is_flat(target[active]):
         return None
     body, residual = Rotation.align_vectors(moved[active], target[active])

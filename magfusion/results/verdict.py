@@ -18,7 +18,7 @@ _LOOKS = {
     "pass": Verdict.TRUSTWORTHY,
     "not proven": Verdict.DOUBTFUL,
 }
-MOST_TEXTS = 3  # of findings of one code; more are counted
+MAX_TEXTS = 3  # of findings of one code; more are counted
 
 
 def look_of(answer: str) -> Verdict:
@@ -57,8 +57,8 @@ def _one_of_each(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
     result = []
     for every in of_code.values():
         texts = list(dict.fromkeys(one.text for one in every))
-        more = len(texts) - MOST_TEXTS
-        text = " ".join([*texts[:MOST_TEXTS], *([f"{more} more of this kind."] * (more > 0))])
+        more = len(texts) - MAX_TEXTS
+        text = " ".join([*texts[:MAX_TEXTS], *([f"{more} more of this kind."] * (more > 0))])
         # That of the most important one, where two are of one key.
         remedy = {k: v for one in reversed(every) for k, v in (one.remedy or {}).items()}
         explained = tuple(dict.fromkeys(code for one in every for code in one.explained))

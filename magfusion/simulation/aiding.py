@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.aiding import LONGEST_INTERVAL, AidingSamples, AidingSensor, Quantity
+from magfusion.model.aiding import MAX_INTERVAL, AidingSamples, AidingSensor, Quantity
 from magfusion.model.site import Site
 from magfusion.simulation.motion import SimulatedMotion
 from magfusion.units import HOUR, Array
@@ -52,7 +52,7 @@ def _relative_pose(motion: SimulatedMotion, sensor: AidingSensor, time: Array) -
 
 
 def _interval(sensor: AidingSensor) -> float:
-    return min(1.0 / sensor.rate_hz, LONGEST_INTERVAL)
+    return min(1.0 / sensor.rate_hz, MAX_INTERVAL)
 
 
 IDEAL: dict[Quantity, Ideal] = {

@@ -30,7 +30,7 @@ from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_moti
 from magfusion.units import HOUR, NANOTESLA, Array, BoolArray, ComplexArray
 
 BLOCK = 60.0  # s
-MOST_HOURS = 1000.0
+MAX_HOURS = 1000.0
 SCHEDULE = Rests(start=40.0, move=180.0, pause=3420.0)
 MARGIN = 10.0  # s before and after a walk in which fields come as often as in it
 DAYTIME = 14.0 * HOUR  # loudest and warmest; the run starts at midnight
@@ -82,7 +82,7 @@ class EnduranceConfig:
 
     def __post_init__(self) -> None:
         """Raise an error if the configuration cannot be simulated."""
-        if not 0.0 < self.hours <= MOST_HOURS:
+        if not 0.0 < self.hours <= MAX_HOURS:
             raise InputError(f"hours: found {self.hours:g}; give more than 0 and at most 1000")
         for name in ("rest_interval", "walk_interval"):
             ratio = BLOCK / getattr(self, name)

@@ -19,7 +19,7 @@ from magfusion.units import MU0_OVER_4PI, Array, ComplexArray, IntArray
 
 AIR = 1e-12  # S/m
 EXACT = 1e-7  # of interpolation
-MOST_NODES = 20  # along an axis
+MAX_NODES = 20  # along an axis
 THINNEST = 1e-3  # m; of the box about the platform
 
 
@@ -91,7 +91,7 @@ def _nodes(
         ellipse = np.maximum(np.abs(singular + root), np.abs(singular - root))
         rate = np.minimum(rate, np.log(ellipse))
     count = np.ceil(-np.log(EXACT) / np.maximum(rate, 1e-9))
-    if np.any(count > MOST_NODES):
+    if np.any(count > MAX_NODES):
         raise InputError(
             f"ground: the platform comes too close to beacon {name}, or to a surface, for its range"
             " of motion; give a smaller box, or omit --ground"

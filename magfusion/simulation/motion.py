@@ -16,7 +16,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 ATTITUDE_KNOT = 1.0  # s of moving
-LONGEST_RAMP = 1.0  # s from rest to full speed
+MAX_RAMP = 1.0  # s from rest to full speed
 _DEGREE = 5
 WANDER = 10.0  # m; a driver corrects his line over some car lengths
 
@@ -218,7 +218,7 @@ def progress_rate(duration: float, rests: Rests) -> BPoly:
     begin = rests.start
     while begin < duration:
         end = min(begin + rests.move, duration)
-        ramp = min(LONGEST_RAMP, (end - begin) / 3.0)
+        ramp = min(MAX_RAMP, (end - begin) / 3.0)
         times += [begin, begin + ramp, end - ramp, end]
         rates += [0.0, 1.0, 1.0, 0.0]
         begin = end + rests.pause

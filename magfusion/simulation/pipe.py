@@ -19,7 +19,7 @@ from scipy.special import ive, kve
 
 from magfusion.units import MU0, MU0_OVER_4PI, AnyArray, Array, ComplexArray
 
-FINE, LEAST_CURVE = 0.5, 4  # of the radius, between poles; segments of a curve
+FINE, MIN_CURVE = 0.5, 4  # of the radius, between poles; segments of a curve
 STEEL_PERMEABILITY, STEEL_CONDUCTIVITY = 100.0, 5e6  # relative, S/m
 
 
@@ -201,7 +201,7 @@ def _ring_field(pipe: Pipe, place: float) -> Array:
     a point on the axis as the radius.
     """
     count = len(pipe.centres_world())
-    finer = max(int(np.ceil(pipe.span / (FINE * pipe.radius))), 1) if count > LEAST_CURVE else 1
+    finer = max(int(np.ceil(pipe.span / (FINE * pipe.radius))), 1) if count > MIN_CURVE else 1
     edges = np.linspace(0.0, pipe.length, count * finer + 1)
     span = float(edges[1])
     offset = place - edges

@@ -16,10 +16,10 @@ from magfusion.simulation.steel import SteelStructure
 from magfusion.units import Array, ComplexArray
 
 FINE = 0.5  # of the distance to the platform and to beacons: length of a segment
-LONGEST = 0.3  # m; of a segment
+MAX_SEGMENT = 0.3  # m; of a segment
 MIN_SEGMENTS = 40  # segments of a bar, whose poles are near its ends
 NEAREST = 0.1  # m; from the surface of steel to where the body moves, and to every beacon
-MOST_SEGMENTS = 1500
+MAX_SEGMENTS = 1500
 TOGETHER = 2_000_000  # components of tensors at once
 
 USAGE = (
@@ -90,12 +90,12 @@ def _segmented(pipes: tuple[Pipe, ...], gaps: list[float], what: str) -> tuple[P
                 f"--rails: number {number} comes within {max(away, 0.0):.2g} m of {what}; keep a"
                 f" distance of {NEAREST:g} m"
             )
-        segment = min(max(FINE * away, 0.05), LONGEST, pipe.length / MIN_SEGMENTS)
+        segment = min(max(FINE * away, 0.05), MAX_SEGMENT, pipe.length / MIN_SEGMENTS)
         whole.append(replace(pipe, segment=segment))
     count = sum(len(pipe.centres_world()) for pipe in whole)
-    if count > MOST_SEGMENTS:
+    if count > MAX_SEGMENTS:
         raise InputError(
-            f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); use shorter rails,"
+            f"--rails: {count} segments are too many (at most {MAX_SEGMENTS}); use shorter rails,"
             " or place them farther from the platform"
         )
     _check_apart(whole)

@@ -14,7 +14,7 @@ from magfusion.units import Array, ComplexArray
 
 POINTS, ORDERS = 64, 4  # of a turn, and of its angle, from steady on, beside the harmonics
 NEGLIGIBLE = 1e-6  # of the moment
-LEAST_DRIFT_TIME = 1.0  # s
+MIN_DRIFT_TIME = 1.0  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def draw_shaft(rotor: Rotor, errors: ShaftErrors, rng: np.random.Generator) -> S
     return Shaft(
         angle_start=float(rng.uniform(0.0, 2.0 * np.pi)),
         drift_hz=rms,
-        drift_time=max(2.0 * (rms / rotor.speed_walk_hz_rts) ** 2, LEAST_DRIFT_TIME),
+        drift_time=max(2.0 * (rms / rotor.speed_walk_hz_rts) ** 2, MIN_DRIFT_TIME),
         slip=float(np.hypot(first, second)),
         slip_phase=float(np.arctan2(second, first)),
         whirl=errors.whirl,

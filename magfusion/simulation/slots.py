@@ -9,8 +9,8 @@ from magfusion.model.marks import SILENT, Marks
 from magfusion.model.site import Beacon, MarkedSlots, Site
 from magfusion.units import Array
 
-LEAST_SAMPLES_PER_SLOT = 4
-SHORTEST_PAUSE = 0.05  # of the longest
+MIN_SAMPLES_PER_SLOT = 4
+MIN_PAUSE = 0.05  # of the longest
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def draw_marks(
     slots = sorted({s for beacon in site.beacons for _, s in beacon.tones if s is not None})
     longest, burst = multiplexer.pause, multiplexer.burst
     count = int(np.ceil(duration / burst))
-    pause = rng.uniform(SHORTEST_PAUSE * longest, longest, count)
+    pause = rng.uniform(MIN_PAUSE * longest, longest, count)
     begin = np.cumsum(pause + burst) - burst
     turn = np.resize(np.array([*slots, SILENT], dtype=np.int64), count)
     return Marks(begin, begin + burst, turn).rows(begin + burst < duration)
@@ -49,7 +49,7 @@ def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> N
         duration = float(np.min(marks.end - marks.begin, initial=np.inf))
     else:
         duration = slots.duration
-    least = LEAST_SAMPLES_PER_SLOT / duration
+    least = MIN_SAMPLES_PER_SLOT / duration
     if rate_hz < least:
         raise InputError(
             f"magnetometer_rate_hz: found {rate_hz} Hz and slots of {duration} s in "

@@ -19,7 +19,7 @@ from magfusion.simulation.rails import magnetised_world
 from magfusion.simulation.slots import Multiplexer, check_slots, slot_gates
 from magfusion.units import Array, ComplexArray
 
-LEAST_SAMPLES_PER_CYCLE = 2.5
+MIN_SAMPLES_PER_CYCLE = 2.5
 USUAL_RATE_HZ, USUAL_SAMPLES_PER_SLOT = 400.0, 16
 
 
@@ -39,7 +39,7 @@ def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
 
     `burst`: length of an unclocked slot (s).
     """
-    least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
+    least = [MIN_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
     lengths = [
         b.slots.duration if isinstance(b.slots, Slots) else burst
         for b in site.beacons
@@ -152,10 +152,10 @@ def _check_tones(site: Site, rate_hz: float, marks: Marks | None, drives: Drives
             # instrument.
             orders = (1, *(one.order for one in beacon.rotor.harmonics))
             highest = beacon.frequency_hz * max(orders)
-        if rate_hz < LEAST_SAMPLES_PER_CYCLE * highest:
+        if rate_hz < MIN_SAMPLES_PER_CYCLE * highest:
             raise InputError(
                 f"magnetometer_rate_hz: found {rate_hz} Hz and a tone of {highest} Hz in beacon "
-                f"{beacon.name}; give at least {LEAST_SAMPLES_PER_CYCLE * highest} Hz"
+                f"{beacon.name}; give at least {MIN_SAMPLES_PER_CYCLE * highest} Hz"
             )
         check_slots(beacon, rate_hz, marks)
 

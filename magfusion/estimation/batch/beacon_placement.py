@@ -42,7 +42,7 @@ MIN_EPOCHS = 10
 EPOCHS_SEARCHED = 120
 GRID = 24  # points along each axis
 MINIMA = 12  # of the grid that are refined
-MOST_REFINED = 4  # of the resulting places
+MAX_REFINED = 4  # of the resulting places
 EQUALLY_GOOD = 0.9  # of the best agreement of an attitude with the drive
 RANGE_MARGIN = 1.4  # of a range from the field's strength alone
 SAME_PLACE = 0.05  # m
@@ -166,7 +166,7 @@ def _centres(detected: DetectedFields) -> list[tuple[Array, float]]:
     for one in np.argsort(cost):
         if all(np.linalg.norm(centres[one] - other) > SAME_PLACE for other, _ in separate):
             separate.append((centres[one], float(there[one])))
-    return separate[:MOST_REFINED] + _mirrors(detected)
+    return separate[:MAX_REFINED] + _mirrors(detected)
 
 
 def _mirrors(detected: DetectedFields) -> list[tuple[Array, float]]:
@@ -180,7 +180,7 @@ def _mirrors(detected: DetectedFields) -> list[tuple[Array, float]]:
     row = len(detected.poses) // 2
     phasor_beacon = detected.phasor_world[row] @ detected.beacon.world_from_beacon
     direction, distance = beacon_directions(detected.beacon, phasor_beacon[None])
-    if direction.shape[1] > MOST_REFINED:  # a cone or a sphere of them
+    if direction.shape[1] > MAX_REFINED:  # a cone or a sphere of them
         return []
     offset_world = (direction[0] * distance[0][:, None]) @ detected.beacon.world_from_beacon.T
     return [(detected.sensor_world[row] - offset, 0.0) for offset in offset_world]

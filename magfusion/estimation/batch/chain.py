@@ -21,7 +21,7 @@ POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exc
 ROTATION_SIGMA = 0.1  # rad; and the possible contribution of the gyro's bias
 LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
 RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
-LEAST_SCATTER = 1e-4  # rad^2; of single-epoch phases, as field models are that wrong
+MIN_SCATTER = 1e-4  # rad^2; of single-epoch phases, as field models are that wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,5 +167,5 @@ def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, clock: Cl
     steady = np.exp(1j * (phase - drifts[np.argmax(share)] * turns))
     scatter = steady - np.mean(steady)
     count = effective_number(np.stack([scatter.real, scatter.imag], axis=1))
-    likelihood = count * np.log1p(LEAST_SCATTER - share**2)
+    likelihood = count * np.log1p(MIN_SCATTER - share**2)
     return float(drifts[np.argmin(likelihood + (drifts / clock.drift_sigma) ** 2)])

@@ -31,7 +31,7 @@ from magfusion.units import Array
 if TYPE_CHECKING:
     from magfusion.estimation.demodulation.motion_from_field import FieldMotion
 
-LONGEST = 120.0  # s; maximum gap that is tracked without an IMU
+MAX_GAP = 120.0  # s; maximum gap that is tracked without an IMU
 # One sigma of the states before a gap; the fields correct them within a few samples.
 FIRST = np.repeat([0.05, 0.1, 1.0, 0.01, 0.1], 3)  # rad, m, m/s, rad/s, m/s^2
 
@@ -78,7 +78,7 @@ def _followed(log: PreprocessedLog, states: Trajectory, calibration: Calibration
     gaps: list[Gap] = []
     for first, last in zip(begin[:-1].tolist(), end[:-1].tolist(), strict=True):
         known = int(np.searchsorted(states.time, first - 0.5 * window)) - 1
-        if known < 0 or last - first > LONGEST:
+        if known < 0 or last - first > MAX_GAP:
             continue
         start = _state(states, known, calibration)
         inside = (waveform.time > start.time) & (waveform.time < last + window)

@@ -39,7 +39,7 @@ from magfusion.units import Array, IntArray
 if TYPE_CHECKING:
     from magfusion.estimation.batch.search import FoundTrajectory
 
-LEAST_DETECTED = 10  # minimum number of epochs with a detected beacon for a start
+MIN_DETECTED = 10  # minimum number of epochs with a detected beacon for a start
 
 
 class OfflineStart(NamedTuple):
@@ -60,11 +60,11 @@ def begin(
     `static`: at the same times; without it every epoch needs a beacon.
     """
     detected = np.asarray(samples.valid.any(axis=1))
-    if static is not None and np.sum(detected) < LEAST_DETECTED:
+    if static is not None and np.sum(detected) < MIN_DETECTED:
         start = _by_earth(samples, static, log.imu, calibration.site)
         return [OfflineStart(start, start.states, calibration, None)]
     # An epoch without a detection has no fix at all, and would end the chain somewhere.
-    some = samples.rows(detected) if np.sum(detected) >= LEAST_DETECTED else samples
+    some = samples.rows(detected) if np.sum(detected) >= MIN_DETECTED else samples
     epochs, gravity = fix_inputs(some, log, calibration.site)
     fixes = fix_epochs(epochs, calibration, gravity=gravity)
     # A beacon that has stopped, or is false, would corrupt the chain.

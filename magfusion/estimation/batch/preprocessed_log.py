@@ -32,7 +32,7 @@ from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array
 
-LONGEST_STEP = 5.0  # s; interval of states without any field
+MAX_STEP = 5.0  # s; interval of states without any field
 REST_STEP = 2.0  # s; the same at rest, where each has a zero velocity
 SPARSE = 2.5  # times the usual interval; a longer one is a gap
 
@@ -201,8 +201,8 @@ def _in_gaps(
     time = samples.time
     step, out = np.diff(time), [np.zeros(0)]
     usual = 0.0 if samples.of_rests else SPARSE * float(np.median(step))
-    for k in np.flatnonzero(step > max(LONGEST_STEP, usual)):
+    for k in np.flatnonzero(step > max(MAX_STEP, usual)):
         inner = np.linspace(time[k], time[k + 1], int(np.ceil(step[k] / REST_STEP)) + 1)[1:-1]
-        every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
+        every = np.arange(1, len(inner) + 1) % int(MAX_STEP / REST_STEP) == 0
         out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])
     return np.concatenate(out)

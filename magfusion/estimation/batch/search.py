@@ -32,7 +32,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 STEP = 0.1  # s; of the epochs that tracks process, unless windows are longer
 VISITS = 6000  # maximum; a longer log has longer steps
-LONGEST_STEP = 2.0  # s; over which an inertial stream still joins fixes
+MAX_STEP = 2.0  # s; over which an inertial stream still joins fixes
 RESTART_INTERVAL = 1.0  # s; between epochs at which tracks may restart
 PHASE_RESTART_EPOCHS = 4  # of these, at which drive phases may restart too
 LEAP = 60.0  # chi square; price of a restart
@@ -126,7 +126,7 @@ def search(
 
 def can_search(samples: FieldSamples) -> bool:
     """Return whether the length of a log suits tracks."""
-    return len(samples) > 2 and float(np.ptp(samples.time)) <= VISITS * LONGEST_STEP
+    return len(samples) > 2 and float(np.ptp(samples.time)) <= VISITS * MAX_STEP
 
 
 def thinned(samples: FieldSamples) -> IntArray:

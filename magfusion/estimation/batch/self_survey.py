@@ -32,7 +32,7 @@ MIN_KNOWN = 2  # beacons; with a single one the trajectory has mirrors
 WIDE_POSITION = 1.0  # m; prior about an estimated place
 WIDE_ROTATION = 0.5  # rad
 RIVAL = 100.0  # chi square above the best, along the first trajectory, that excludes a hypothesis
-MOST_SMOOTHED = 3
+MAX_SMOOTHED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ def decide(
     def misfit(choice: tuple[int, ...]) -> float:
         return sum(p.hypotheses[i].chi_square for p, i in zip(result, choice, strict=True))
 
-    choices = sorted(choices, key=misfit)[:MOST_SMOOTHED]
+    choices = sorted(choices, key=misfit)[:MAX_SMOOTHED]
     results = []
     for choice in choices:
         chosen = [p.hypotheses[i].beacon for p, i in zip(result, choice, strict=True)]

@@ -21,12 +21,12 @@ from magfusion.units import Array
 
 IRON_SPAN = 0.5  # s; short enough for little rotation
 USUAL_MATRIX, USUAL_OFFSET = 0.1, 1.0  # relative to the field's size; of iron, one sigma
-LEAST_STEPS = 20
-LEAST_TURN = 0.1  # rad/s, rms
+MIN_STEPS = 20
+MIN_ROTATION = 0.1  # rad/s, rms
 USUAL_BIAS = 0.02  # rad/s; of the gyroscope, one sigma
 LIMIT = 8.5  # sigma of twelve numbers, 6 of one
 USUAL_MOUNTING = 0.1  # rad
-LEAST_SHARE = 0.01  # of the field's size, from which iron is reported
+MIN_SHARE = 0.01  # of the field's size, from which iron is reported
 EXPLAINED = 0.8  # share of the residual
 EXACT = 1e-6  # sigma of a matrix that is declared to be exact
 AS_WELL = 2.0  # ratio of what remains by a magnet to that by any iron, up to which it is a magnet
@@ -70,7 +70,7 @@ def fitted_iron(means: StillMeans, matrix_sigma: float = USUAL_MATRIX) -> BodyIr
     `means`: over spans of `IRON_SPAN`, by the declared calibration of the magnetometer.
     `matrix_sigma`: of the soft iron.
     """
-    if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
+    if len(means) < MIN_STEPS or not np.all(np.isfinite(means.field_body)):
         return None
     size = float(np.median(np.linalg.norm(means.field_body, axis=1)))
     following = np.diff(means.time) < 1.5 * IRON_SPAN
@@ -78,10 +78,10 @@ def fitted_iron(means: StillMeans, matrix_sigma: float = USUAL_MATRIX) -> BodyIr
     attitude = means.still_from_body
     turn = np.swapaxes(attitude[1:], 1, 2) @ attitude[:-1]
     turn, before, after = turn[following], field[:-1][following], field[1:][following]
-    if len(turn) < LEAST_STEPS:
+    if len(turn) < MIN_STEPS:
         return None
     angle = np.arccos(np.clip(0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
-    if not np.sqrt(np.mean(angle**2)) > LEAST_TURN * IRON_SPAN:
+    if not np.sqrt(np.mean(angle**2)) > MIN_ROTATION * IRON_SPAN:
         return None
     residual = after - np.einsum("nij,nj->ni", turn, before)
     result, cov, explained = _fitted(turn, before, residual, matrix_sigma)
@@ -109,7 +109,7 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     allowed = iron.cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
     weight = float(np.sqrt(result @ np.linalg.solve(allowed, result)))
     share = max(float(np.max(np.abs(soft))), float(np.linalg.norm(hard)))
-    if not (weight > LIMIT and iron.explained > EXPLAINED and share > LEAST_SHARE):
+    if not (weight > LIMIT and iron.explained > EXPLAINED and share > MIN_SHARE):
         return
     of_matrix, of_offset = float(np.sqrt(np.mean(soft**2))), float(np.linalg.norm(iron.offset_body))
     yield Finding(

@@ -17,7 +17,7 @@ from magfusion.estimation.data_checks.samples import (
     frozen_samples,
     streams,
 )
-from magfusion.files.lost_rows import MOST_MISSING
+from magfusion.files.lost_rows import MAX_MISSING
 from magfusion.files.plausible import RANGE_KEYS, declared_range, exceeds
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -53,7 +53,7 @@ def _within_range(log: Log, site: Site) -> Log:
             continue
         key = f"platform.{RANGE_KEYS[stream.name]}"
         text = f"{stream.name}: {len(rows)} samples are beyond the range of {largest:g} in {key}"
-        if len(rows) > MOST_MISSING * len(stream.value):
+        if len(rows) > MAX_MISSING * len(stream.value):
             raise InputError(f"{text}, of {len(stream.value)}; correct {key}, or the samples' unit")
         result[stream.name] = rows
         text = f"{text}. They are left out."

@@ -49,7 +49,9 @@ SAMPLE_TESTS: tuple[SampleTest, ...] = (
     range_step,
     silent_aiding,
 )
-LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
+MAX_DURATION = (
+    1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
+)
 MOUNTED = 0.1  # rad; largest sigma of a mounting that is known
 # Of gyroscope and clocks: where they are wrong, the gyro-stabilized axes are wrong too.
 UNSTEADY = frozenset(
@@ -176,7 +178,7 @@ def _matters(line: Finding) -> bool:
     return line.verdict is not Verdict.TRUSTWORTHY or line.code == "fitted_line"
 
 
-def beginning(log: Log, span: float = LONGEST) -> Log:
+def beginning(log: Log, span: float = MAX_DURATION) -> Log:
     """Return the first part of a log, of a length (s)."""
     end = float(log.imu.time[0]) + span if len(log.imu) else span
     if len(log.imu) and log.imu.time[-1] > end:

@@ -34,10 +34,10 @@ from magfusion.units import Array
 OWN_LINE_RATIO = 3.0  # a line near a tone and this many times as strong is the beacon itself
 CONSEQUENCE = 3.0  # times the model's error of a tone, from which a leak casts doubt
 FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise near the tones accounts for
-LEAST_MODEL_ERROR = 2e-3
+MIN_MODEL_ERROR = 2e-3
 LISTED = 4
 BEGINNING = 60.0  # s; in which the lines to fit with the tones are searched
-MOST_FITTED = 6  # number of fitted lines
+MAX_FITTED = 6  # number of fitted lines
 LONGER = 2.0  # times the usual window, to separate a line from a tone
 SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
 
@@ -70,7 +70,7 @@ def with_disturbing_lines(
     _, tones = map(np.array, zip(*named_tones(site), strict=True))
     chosen: tuple[float, ...] = ()
     for line in undeclared(result, site):
-        if len(chosen) == MOST_FITTED:
+        if len(chosen) == MAX_FITTED:
             break
         if _consequence(result, line, site, settings)[0] <= CONSEQUENCE:
             continue
@@ -169,7 +169,7 @@ def _consequence(
     lines_found: Spectrum, line: SpectralLine, site: Site, settings: LockinSettings
 ) -> tuple[float, str]:
     """Return a line's leakage in units of the model's error, and its description."""
-    error = max(site.model_error, LEAST_MODEL_ERROR)
+    error = max(site.model_error, MIN_MODEL_ERROR)
     mains = settings.mains_hz
     order = max(round(line.frequency_hz / mains), 1) if mains > 0.0 else 1
     # A fitted line leaks only in proportion to its frequency error.

@@ -21,10 +21,10 @@ from magfusion.units import Array, BoolArray
 
 CUTOFF = 2.0  # Hz
 REACH = 1.6  # half width of the low-pass filter, in its own periods
-LEAST_TURN = 0.05  # rad/s; slower rotation is not compared
+MIN_ROTATION = 0.05  # rad/s; slower rotation is not compared
 CONTRADICTED = 0.5  # explained share of db/dt below which the axes are not those declared
 EXPLAINED = 0.7  # by the alternative that is reported
-LONGEST_LAG = 3.0  # s
+MAX_LAG = 3.0  # s
 LAG_STEP = 0.02  # s
 CORRELATED = 2.0  # consecutive rows, of filtered rates or of spans, that share one residual
 _EPSILON = np.zeros((3, 3, 3))
@@ -180,7 +180,7 @@ def rotation_in(log: Log, site: Site) -> FieldRotation | None:
         return None
     offset = site.platform.imu.time_offset
     result = turning(log.imu, log.vectors.time, field_body(log, site), offset)
-    return result if len(result.change) >= 12 and result.speed > LEAST_TURN else None
+    return result if len(result.change) >= 12 and result.speed > MIN_ROTATION else None
 
 
 def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
@@ -225,7 +225,7 @@ class Clocks:
 
     def lag(self, part: slice = slice(None)) -> tuple[float, float]:
         """Return the best time shift of the inertial stamps in a part (s), and its agreement."""
-        count = int(LONGEST_LAG / LAG_STEP)
+        count = int(MAX_LAG / LAG_STEP)
         field, change, rate = self.field[part], self.change[part], self.rate[part]
         if len(field) < 4 * count:
             return 0.0, -np.inf

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magfusion.estimation.data_checks.samples import CHANCE, SHORTEST_FREEZE
+from magfusion.estimation.data_checks.samples import CHANCE, MIN_FREEZE
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
@@ -83,8 +83,7 @@ class Freeze:
         usual = min(max(self._repeat_count / max(self._seen, 1), 1e-3), 0.97)
         by_chance = np.log(CHANCE / SAMPLES) / np.log(usual)
         return (
-            self._repeats >= max(by_chance, MIN_REPEATS)
-            and time - self.frozen_since >= SHORTEST_FREEZE
+            self._repeats >= max(by_chance, MIN_REPEATS) and time - self.frozen_since >= MIN_FREEZE
         )
 
 

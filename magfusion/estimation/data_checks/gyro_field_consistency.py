@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.estimation.data_checks.field_rotation import (
     CONTRADICTED,
     EXPLAINED,
-    LEAST_TURN,
+    MIN_ROTATION,
     Clocks,
     FieldRotation,
     axes,
@@ -23,9 +23,9 @@ from magfusion.units import DEGREE, Array
 
 NOT_AT_ALL = 5.0  # times more slowly than the gyroscope says, a field stands still
 BETTER = 2.0  # times less misfit by the first explanation than by the next
-LEAST_LAG = 0.03  # s
+MIN_LAG = 0.03  # s
 LAG_LIMIT = 4.0  # sigma of the declared time offset
-LEAST_ANGLE = 6.0 * DEGREE
+MIN_ANGLE = 6.0 * DEGREE
 # Least deviation of the gyroscope's scale that is reported; iron on the body looks like tenths.
 SCALE = 0.5
 SCALE_EXPLAINED = 0.9  # of the turn by it
@@ -43,7 +43,7 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
     rotation = turning(log.imu, time, field, offset)
     if len(rotation.change) < 12:
         return
-    if not rotation.speed > LEAST_TURN:
+    if not rotation.speed > MIN_ROTATION:
         yield from _turns_alone(log, site, rotation)
         return
     if site is None:
@@ -60,7 +60,7 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
         return
     clock = Clocks(log, time, field, offset)
     sigma = 0.01 if site is None else site.platform.imu.time_offset_sigma
-    late = _other_clock(clock, rotation, max(LEAST_LAG, LAG_LIMIT * sigma), offset)
+    late = _other_clock(clock, rotation, max(MIN_LAG, LAG_LIMIT * sigma), offset)
     if late is not None:
         yield late
     elif rotation.explained(np.eye(3)) > CONTRADICTED:
@@ -117,7 +117,7 @@ def _contradicted(rotation: FieldRotation) -> Iterator[Finding]:
     if explained > EXPLAINED and BETTER * (1.0 - explained) < 1.0 - declared:
         single = BETTER * (1.0 - explained) < 1.0 - rotation.explained(ranked[1])
         yield _other_axes(rotation, best, single=single)
-    elif rotation.expected_rate > LEAST_TURN:
+    elif rotation.expected_rate > MIN_ROTATION:
         yield Finding(
             "gyro_field",
             f"gyroscope: {_words(rotation)}, and no exchange of axes or sign explains more than"
@@ -144,7 +144,7 @@ def _turned_little(rotation: FieldRotation, site: Site | None) -> Iterator[Findi
     turn, sigma, better = rotation.mounting()
     angle = float(np.linalg.norm(turn))
     known = float(np.max(site.platform.magnetometer.sigma.rotation_sensor))
-    least = max(LEAST_ANGLE, DETECTION_SIGMAS * float(np.hypot(known, sigma)))
+    least = max(MIN_ANGLE, DETECTION_SIGMAS * float(np.hypot(known, sigma)))
     if better > BETTER and angle > least:
         axis = ", ".join(f"{v:+.2f}" for v in turn / angle)
         yield Finding(
@@ -154,7 +154,7 @@ def _turned_little(rotation: FieldRotation, site: Site | None) -> Iterator[Findi
             f" {better:.0f} times less from the gyroscope's. Correct rpy_deg of"
             " platform.magnetometer.body_from_sensor.",
             Verdict.DOUBTFUL,
-            angle / LEAST_ANGLE,
+            angle / MIN_ANGLE,
         )
 
 
@@ -165,7 +165,7 @@ def _turns_alone(log: Log, site: Site | None, rotation: FieldRotation) -> Iterat
         f"gyroscope: it measures {expected / DEGREE:.2g} deg/s (rms), and the static field does"
         " not rotate"
     )
-    if not expected > max(LEAST_TURN, NOT_AT_ALL * rotation.speed) or site is None:
+    if not expected > max(MIN_ROTATION, NOT_AT_ALL * rotation.speed) or site is None:
         return
     imu = site.platform.imu
     rate_hz = 1.0 / float(np.median(np.diff(log.imu.time)))

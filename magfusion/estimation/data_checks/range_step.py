@@ -12,8 +12,8 @@ from magfusion.units import Array
 
 BLOCK = 0.25  # s; longer than a period of the tones, shorter than most turns
 NEAR = 8  # blocks on either side, of which the static field is compared
-LEAST_STEP = 0.25  # of the logarithm of the gain; ranges of instruments differ by more
-LEAST_TONES = 0.25  # of the step, by which tones step as well; motion changes them meanwhile
+MIN_STEP = 0.25  # of the logarithm of the gain; ranges of instruments differ by more
+MIN_TONES = 0.25  # of the step, by which tones step as well; motion changes them meanwhile
 NO_FIELD = 1e-15  # T; below any instrument, to keep logarithms finite
 CERTAIN = 6.0  # times the scatter of the static field on either side
 
@@ -34,8 +34,8 @@ def range_step(log: Log, site: Site | None) -> Iterator[Finding]:
     step = float(np.median(after) - np.median(before))
     of_tones = np.log(max(_tones(field[at + 1]), NO_FIELD) / max(_tones(field[at - 1]), NO_FIELD))
     if (
-        abs(step) > max(LEAST_STEP, CERTAIN * float(max(np.std(before), np.std(after))))
-        and of_tones / step > LEAST_TONES
+        abs(step) > max(MIN_STEP, CERTAIN * float(max(np.std(before), np.std(after))))
+        and of_tones / step > MIN_TONES
     ):
         time = float(np.mean(wave.time[at * size : (at + 1) * size]))
         yield Finding(

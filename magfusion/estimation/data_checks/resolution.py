@@ -10,7 +10,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 ONE_STEP = 1.5  # steps of an instrument; less is one
 REST = 2.5  # steps; an axis at rest between two of them reads no more than three values
-LEAST_PAUSES, EVEN = 5, 0.1  # of a multiplexer, and their largest relative difference
+MIN_PAUSES, EVEN = 5, 0.1  # of a multiplexer, and their largest relative difference
 
 
 def step_of_axes(value: Array) -> Array:
@@ -45,7 +45,7 @@ def within_a_step(
 
 def is_scheduled(first: IntArray, last: IntArray) -> bool:
     """Return whether stretches are equally long and equally far apart: a multiplexer's pauses."""
-    if len(first) < LEAST_PAUSES:
+    if len(first) < MIN_PAUSES:
         return False
     inner = slice(1, -1)  # those at the ends of a log are cut
     return all(

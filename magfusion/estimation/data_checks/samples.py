@@ -27,18 +27,18 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
 CHANCE = 1e-7  # probability of a false alarm per stream
-SHORTEST_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch is missed
+MIN_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch is missed
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
 WHOLE = 0.99  # of the log, of which nothing remains to use
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
-LEAST_WRAPS = 2
+MIN_WRAPS = 2
 AT_END = 0.9  # of the largest value
 SLOW = 0.1  # of it; steps of an axis that follows the field or the motion
-LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
+MIN_AT_LIMIT, MIN_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
 SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
 MAX_PASSES = 8
-LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
+MIN_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
 # Deviations over the differences of the neighbours, and of all but an outer one that may be false.
 AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
 EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
@@ -99,7 +99,7 @@ def frozen(stream: InstrumentStream, axes: tuple[int, ...]) -> Runs:
     usual = float(np.quantile(shares, 0.4))
     by_chance = np.log(CHANCE / count) / np.log(min(max(usual, 1e-3), 0.97))
     step = float(np.median(np.diff(stream.time)))
-    least = max(by_chance, SHORTEST_FREEZE / step, 6.0)
+    least = max(by_chance, MIN_FREEZE / step, 6.0)
     result = runs(same)
     long = result.last - result.first >= least
     first, last = result.first[long], result.last[long]
@@ -186,7 +186,7 @@ def _clipped_axes(stream: InstrumentStream, site: Site | None) -> Iterator[Findi
         for first, last in zip(still.first, still.last, strict=True):
             kept[first : last + 1] = False
         value = value[kept]
-    if len(value) < LEAST_PILE:
+    if len(value) < MIN_AT_LIMIT:
         return
     largest = float(np.max(np.abs(value)))
     declared = np.inf if site is None else declared_range(stream.name, site.platform)
@@ -215,7 +215,7 @@ def wrapped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
         for axis in range(len(stream.axes)):
             value = stream.value[:, axis]
             at = wraps(value)
-            if len(at) < LEAST_WRAPS:
+            if len(at) < MIN_WRAPS:
                 continue
             limit = float(np.max(np.abs(value)))
             yield Finding(
@@ -247,7 +247,7 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     limit = float(np.max(value))
     at = value == limit
     count = int(np.sum(at))
-    if count < LEAST_PILE or (count > ALWAYS * len(value) and limit < largest):
+    if count < MIN_AT_LIMIT or (count > ALWAYS * len(value) and limit < largest):
         return 0, limit
     highest = min(8 * count, len(value))
     below = np.unique(np.partition(value, -highest)[-highest:])
@@ -261,7 +261,7 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     fixed = float(np.mean(separate)) if len(separate) else 0.0
     by_chance = np.log(CHANCE) / np.log(min(max(fixed, 1e-3), 0.97))
     pile = count > PILE * nearby
-    return (count if pile and longest >= max(LEAST_RUN, 0.5 * by_chance) else 0), limit
+    return (count if pile and longest >= max(MIN_RUN, 0.5 * by_chance) else 0), limit
 
 
 def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
@@ -371,7 +371,7 @@ def _false_runs(stream: InstrumentStream) -> IntArray:
 
 def are_few(spikes: int, samples: int) -> bool:
     """Return whether so many spikes among so many samples may be knocks."""
-    return spikes < max(LEAST_SPIKES, SPIKE_SHARE * samples)
+    return spikes < max(MIN_SPIKES, SPIKE_SHARE * samples)
 
 
 def is_predictable(stream: InstrumentStream, site: Site | None) -> bool:

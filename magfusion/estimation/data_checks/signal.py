@@ -26,7 +26,7 @@ SILENCE = 1.0  # s; shorter silence is not reported
 FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
 NEAR = 10  # epochs beside a silence that it is compared with
 EDGE = 3  # epochs in which the field of a beacon that is switched off falls
-LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
+MIN_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
 CERTAIN_DETECTION_RATIO = (
     3.0  # times the weakest detectable field: beyond, one of many beacons must be detected
 )
@@ -264,7 +264,7 @@ def _silences(
         elapsed &= float(np.median(amplitude[first:last])) < FALLEN * float(np.median(others))
         # Who drives out of range leaves it at the weakest field that is detected.
         edges = np.append(snr[max(first - EDGE, 0) : first], snr[last : last + EDGE])
-        elapsed &= float(np.max(edges, initial=0.0)) > CERTAIN_DETECTION_RATIO * LEAST_SNR
+        elapsed &= float(np.max(edges, initial=0.0)) > CERTAIN_DETECTION_RATIO * MIN_SNR
         stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
         (off if elapsed else masked).append(stretch)
     return off, masked

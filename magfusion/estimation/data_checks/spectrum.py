@@ -18,8 +18,8 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.units import Array
 
-SEGMENT, SHORTEST, SHARE = 8.0, 2.0, 0.35  # s, s, of the log
-LEAST_SEGMENTS = 3
+SEGMENT, MIN_SEGMENT, SHARE = 8.0, 2.0, 0.35  # s, s, of the log
+MIN_SEGMENTS = 3
 LOWEST_HZ = 3.0  # Hz; below, the spectrum is that of motion
 STAND_OUT = 30.0  # a line has this many times the neighbouring power
 NEIGHBOUR_BAND_HZ = 2.5  # on either side, where that power is measured
@@ -92,9 +92,9 @@ def spectrum(log: Log, site: Site | None) -> Spectrum | None:
     if site is not None and is_bandpass(site, 1.0 / step):
         return None
     duration = float(wave.time[-1] - wave.time[0])
-    length = int(np.clip(SHARE * duration, SHORTEST, SEGMENT) / step)
+    length = int(np.clip(SHARE * duration, MIN_SEGMENT, SEGMENT) / step)
     count = int(duration / step) + 1
-    if 2 * count // length - 1 < LEAST_SEGMENTS:
+    if 2 * count // length - 1 < MIN_SEGMENTS:
         return None
     field = still_field(log, site)
     if np.max(np.abs(np.diff(wave.time) - step)) > 1e-3 * step:

@@ -24,8 +24,8 @@ ROUNDING = 1e-6  # of a step
 MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
 MIN_LOST_SHARE = 1e-3  # that is no error of its rate
 # Of aiding sensors: beyond it the position by an IMU alone is off by decimetres.
-LONGEST_SILENCE = 5.0  # s
-LONGEST_SILENCE_STEPS = 20.0  # medians between two samples, where the sensor is slower than that
+MAX_SILENCE = 5.0  # s
+MAX_SILENCE_STEPS = 20.0  # medians between two samples, where the sensor is slower than that
 MIN_SAMPLES = 20  # of which the usual step is known
 
 
@@ -244,7 +244,7 @@ def _gaps(
         )
     elif sensor.quantity != "mark" and len(inside) >= MIN_SAMPLES:
         edges = np.concatenate([[begin], inside, [end]])
-        longest = max(LONGEST_SILENCE, LONGEST_SILENCE_STEPS * float(np.median(np.diff(inside))))
+        longest = max(MAX_SILENCE, MAX_SILENCE_STEPS * float(np.median(np.diff(inside))))
         first = np.flatnonzero(np.diff(edges) > longest)
         parts = [f"{edges[i]:.1f} to {edges[i + 1]:.1f} s" for i in first[:LISTED]]
         if parts:

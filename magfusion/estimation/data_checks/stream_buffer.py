@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.units import Array
 
-LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams means a clock jump
+MAX_JUMP = 60.0  # s; a stamp farther from the newest of all streams means a clock jump
 
 
 def check_clock(name: str, time: Array, newest: float) -> None:
@@ -20,12 +20,12 @@ def check_clock(name: str, time: Array, newest: float) -> None:
     if len(time) == 0:
         return
     newest = float(time.min()) if newest == -np.inf else newest
-    if time.min() >= newest - LARGEST_JUMP and time.max() <= newest + LARGEST_JUMP:
+    if time.min() >= newest - MAX_JUMP and time.max() <= newest + MAX_JUMP:
         return  # the usual case
     stamps = np.sort(np.append(time, newest))
     steps = np.diff(stamps)
     k = int(np.argmax(steps))
-    if steps[k] > LARGEST_JUMP:
+    if steps[k] > MAX_JUMP:
         way = "back" if stamps[k] < newest else "ahead"
         raise InputError(
             f"{name}: its clock jumped {way} by {steps[k]:.4g} s at {newest:.3f} s."

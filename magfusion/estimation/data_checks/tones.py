@@ -29,7 +29,7 @@ from magfusion.units import Array, ComplexArray
 
 MIN_RELATIVE_STRENGTH = 3e-3  # of the strongest line; a weaker one is not considered a beacon
 DISTORTION = 0.3  # of a tone, below which its multiple is a harmonic
-LONGEST, SHORTEST = 1.0, 0.25  # s, of a window
+MAX_WINDOW, MIN_WINDOW = 1.0, 0.25  # s, of a window
 CYCLES_APART = 4.0  # periods of the beat with the nearest line in a window
 # Two equal coils in quadrature draw an ellipse with axes from 1:1 to 1:2, a single one a line.
 ROTATING = 0.25  # ratio of the axes, above which there are two coils
@@ -114,7 +114,7 @@ def _distorted(line: SpectralLine, selected: list[SpectralLine], result: Spectru
 def _tone(line: SpectralLine, every: Array, time: Array, field: Array) -> Tone:
     separate = np.abs(every[every != line.frequency_hz] - line.frequency_hz)
     nearest = float(np.min(separate, initial=line.frequency_hz))
-    window = float(np.clip(CYCLES_APART / nearest, SHORTEST, LONGEST))
+    window = float(np.clip(CYCLES_APART / nearest, MIN_WINDOW, MAX_WINDOW))
     frequency, sigma = line.frequency_hz, 1.0 / float(time[-1] - time[0])
     for _ in range(2):
         centre, phasor = _phasors(time, field, frequency, window)

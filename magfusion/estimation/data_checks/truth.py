@@ -19,7 +19,7 @@ SPAN = 0.5  # s; between two attitudes that are compared
 MIN_SPANS = 10
 MAX_GAP = 2.0  # s; between them, over which the bias of a gyroscope makes no rotation
 MAX_IMU_STEP = 0.1  # s; of inertial samples, in a gap of which nothing is compared
-LEAST_TURN = 0.03  # rad in a span; a body that turns less shows nothing
+MIN_ROTATION = 0.03  # rad in a span; a body that turns less shows nothing
 FROZEN = 0.05  # of the gyroscope's rotation; a truth that turns less has stopped
 FROZEN_SHARE = 0.1  # of the spans with a rotation
 TOLERANCE, TOLERANCE_SHARE = 0.02, 0.25  # rad, and of the rotation; gyroscopes do better
@@ -33,7 +33,7 @@ NED = (
     " evaluate with --truth-axes ned."
 )
 MAX_DELAY, DELAY_STEP = 1.0, 0.01  # s; searched either way, and in steps
-LEAST_DELAY = 0.03  # s; filters of gyroscopes delay by less
+MIN_DELAY = 0.03  # s; filters of gyroscopes delay by less
 EXPLAINED = 0.5  # of the squared errors that a delay leaves
 MIN_CORRELATION = 0.8  # of accelerations along the axis of least motion; noise has none
 # The components w, x, y, z that are meant, by their places among those that were read.
@@ -111,7 +111,7 @@ def _delay_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     before, least, after = errors[np.clip([best - 1, best, best + 1], 0, len(delays) - 1)]
     bend = max(before - 2.0 * least + after, 1e-30)
     delay = float(delays[best] + 0.5 * DELAY_STEP * (before - after) / bend)
-    if abs(delay) < LEAST_DELAY or abs(delay) > MAX_DELAY - DELAY_STEP:
+    if abs(delay) < MIN_DELAY or abs(delay) > MAX_DELAY - DELAY_STEP:
         return ""
     if least > EXPLAINED * now or now - least < np.var(change) / len(rows):
         return ""
@@ -160,7 +160,7 @@ def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
 def _rotation_text(attitude: Rotation, rows: IntArray, gyro: Array) -> str:
     """Return how rotations of the truth differ from those of the gyroscope (m, 3) (rad)."""
     size = np.linalg.norm(gyro, axis=1)
-    active = (size > LEAST_TURN) & (size < 0.5 * np.pi)
+    active = (size > MIN_ROTATION) & (size < 0.5 * np.pi)
     if np.sum(active) < MIN_SPANS:
         return ""
     rows, gyro, size = rows[active], gyro[active], size[active]
@@ -206,7 +206,7 @@ def quaternion_text(attitude: Rotation, rows: IntArray, rotations: Array) -> str
     axes, of a gyroscope or an estimate, shape (m, 3) (rad).
     """
     size = np.linalg.norm(rotations, axis=1)
-    active = (size > LEAST_TURN) & (size < 0.5 * np.pi)
+    active = (size > MIN_ROTATION) & (size < 0.5 * np.pi)
     rows, rotations = rows[active], rotations[active]
     if len(rows) < MIN_SPANS or _agrees(rotation_changes(attitude, rows), rotations):
         return ""

@@ -18,7 +18,7 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import IntArray
 
-MOST_AT_START = 16  # beacons; with more, a start takes longer, and sigmas stay
+MAX_START_BEACONS = 16  # beacons; with more, a start takes longer, and sigmas stay
 DETECTION_SIGMAS = 1.0  # sigmas of a phasor: a beacon below it everywhere is not detected
 
 
@@ -68,7 +68,7 @@ def select_strongest(log: Log, site: Site) -> tuple[Log, Site]:
         return log, site
     power = np.nansum(np.abs(log.fields.phasor_sensor) ** 2, axis=(0, 2))
     by_beacon = np.bincount(site.owner, power, len(site.beacons))
-    strongest = np.sort(np.argsort(-by_beacon, kind="stable")[:MOST_AT_START])
+    strongest = np.sort(np.argsort(-by_beacon, kind="stable")[:MAX_START_BEACONS])
     fields = samples_of(log.fields, channels_of(site, strongest))
     return replace(log, fields=fields), _with_beacons(site, strongest)
 

@@ -17,7 +17,7 @@ from magfusion.receiver.admission import Windows
 from magfusion.receiver.joint import NODES, JointDesigns
 from magfusion.receiver.noise import not_below, smoothed_over_windows
 from magfusion.receiver.turn import body_turn_of, measured_from_body
-from magfusion.receiver.windows import LONGEST_WINDOW
+from magfusion.receiver.windows import MAX_WINDOW
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 128  # windows whose covariances fit the cache
@@ -180,7 +180,7 @@ def _seen(
 
 def _predicted_channels(calibration: Calibration, states: Trajectory) -> BoolArray:
     """Return which channels are predicted at states, shape (n, channels)."""
-    site, active_beacons = calibration.site, ActiveBeacons.of(calibration, LONGEST_WINDOW)
+    site, active_beacons = calibration.site, ActiveBeacons.of(calibration, MAX_WINDOW)
     if active_beacons.least is None:
         return np.ones((len(states), len(site.channels)), dtype=bool)
     largest = largest_fields(site, sensor_positions(site, states)[:, 0])

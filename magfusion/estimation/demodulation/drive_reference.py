@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.channel_effects import driven
-from magfusion.model.drive import LEAST_ON, DriveSamples, DriveShares
+from magfusion.model.drive import MIN_CURRENT_SHARE, DriveSamples, DriveShares
 from magfusion.model.samples import FieldSamples, Log, RotorAngles
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
@@ -109,6 +109,6 @@ def referred(fields: FieldSamples, site: Site) -> FieldSamples:
         return fields
     share = np.exp(known[0] + 1j * known[1])
     phasor = fields.phasor_sensor / share[..., None]
-    phasor[known[0] < np.log(LEAST_ON)] = np.nan
+    phasor[known[0] < np.log(MIN_CURRENT_SHARE)] = np.nan
     cov = fields.phasor_cov * np.exp(-2.0 * known[0])[..., None, None]
     return replace(fields, phasor_sensor=phasor, phasor_cov=cov)

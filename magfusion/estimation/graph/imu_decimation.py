@@ -28,7 +28,7 @@ from magfusion.units import Array, BoolArray, IntArray
 JOINED = (25, 20, 10)  # steps joined to one
 MIN_JOINED_STEPS = 20  # minimum of joined steps in an interval: sigmas differ by some thousandths
 ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where errors of sigmas by a tenth are harmless
-MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
+MAX_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
 CHUNK = 32_768  # steps joined at a time: intermediate results stay in the cache
 STRETCH = 200_000  # samples cut at a time: bounds the memory in a long log
 _STATIONARY_STEP = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
@@ -233,7 +233,7 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     both[3:6] = np.linalg.solve(system, whole).reshape(-1, 2, 3).T
     both[:6] += bias[:, None]
     both[6] = dt
-    return both, angle.sum(axis=0).max(axis=0) < MOST_TURN
+    return both, angle.sum(axis=0).max(axis=0) < MAX_TURN
 
 
 def _small_vectors(turn: Array) -> Array:

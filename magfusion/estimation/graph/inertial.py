@@ -8,7 +8,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.graph.preintegration import (
-    SHORTEST_STEP,
+    MIN_STEP,
     Increments,
     across_held,
     preintegrate,
@@ -48,7 +48,7 @@ class Steps:
         )
         out = []
         for rows, dt in parts:
-            kept = dt > SHORTEST_STEP
+            kept = dt > MIN_STEP
             gyro, accel, first = own.gyro_body[rows], own.accel_body[rows], [0, int(kept.sum())]
             increments = replace(
                 own,

@@ -19,12 +19,12 @@ from magfusion.units import Array, BoolArray, IntArray
 BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
 BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
-LEAST_HELD = 1e-4  # rad/s, and that per root s, about a fixed axis: no motion, but regular
-SHORTEST_STEP = 1e-9  # s; the rounding of a time stamp, and no step
+MIN_HELD_RATE = 1e-4  # rad/s, and that per root s, about a fixed axis: no motion, but regular
+MIN_STEP = 1e-9  # s; the rounding of a time stamp, and no step
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
-# s; a bias that walks by `white noise / LONGEST_WHITE` adds a third of the noise's variance to an
+# s; a bias that walks by `white noise / MAX_WHITE` adds a third of the noise's variance to an
 # attitude or a velocity after this time. A slower one would tie states to the last digit.
-LONGEST_WHITE = 300.0
+MAX_WHITE = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def _curvature_corrected(imu: ImuSamples) -> Array:
     both = np.concatenate([imu.gyro_body, imu.accel_body], axis=1)
     if len(both) < 3:
         return both
-    step = np.maximum(np.diff(imu.time), SHORTEST_STEP)[:, None]
+    step = np.maximum(np.diff(imu.time), MIN_STEP)[:, None]
     before, after = step[:-1], step[1:]
     # The smaller step squared: a gap, or a stamp that is early, does not enlarge it.
     curved = np.diff(np.diff(both, axis=0) / step, axis=0) / (6.0 * (before + after))
@@ -152,8 +152,8 @@ def bias_walks(imu: ImuModel) -> tuple[float, float]:
     Returns (rad/s/sqrt(s), m/s^2/sqrt(s)).
     """
     return (
-        max(imu.gyro_bias_walk, imu.gyro_noise / LONGEST_WHITE),
-        max(imu.accel_bias_walk, imu.accel_noise / LONGEST_WHITE),
+        max(imu.gyro_bias_walk, imu.gyro_noise / MAX_WHITE),
+        max(imu.accel_bias_walk, imu.accel_noise / MAX_WHITE),
     )
 
 
@@ -163,7 +163,7 @@ def across_held(cov: Array, imu: ImuModel) -> Array:
         return cov
     axis = np.array(imu.held_axis)
     across = np.eye(3) - np.outer(axis, axis)
-    return np.asarray(across @ cov @ across + LEAST_HELD**2 * np.outer(axis, axis))
+    return np.asarray(across @ cov @ across + MIN_HELD_RATE**2 * np.outer(axis, axis))
 
 
 @lru_cache(maxsize=8)

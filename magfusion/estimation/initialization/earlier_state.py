@@ -14,7 +14,7 @@ from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
 
 CONTRADICTION = 1e-6  # probability of a larger difference, if both are of one platform
-LEAST_KNOWN = 0.99  # of the prior's variance; a larger share is no knowledge
+MIN_UNKNOWN_SHARE = 0.99  # of the prior's variance; a larger share is no knowledge
 
 
 def with_earlier(
@@ -41,7 +41,7 @@ def with_earlier(
     whiten = np.linalg.inv(np.linalg.cholesky(_prior(site, estimated)[np.ix_(rows, rows)]))
     cov = earlier.cov + _walked(earlier, site, walk, state.time, elapsed)
     variance, axes = np.linalg.eigh(whiten @ cov[np.ix_(rows, rows)] @ whiten.T)
-    known = variance < LEAST_KNOWN
+    known = variance < MIN_UNKNOWN_SHARE
     variance, into = variance[known], axes[:, known].T @ whiten
     # The earlier estimate without the prior: mean and sigma along the axes, in prior sigmas.
     mean = into @ between(of_site, earlier, walk.blocks)[rows] / (1.0 - variance)

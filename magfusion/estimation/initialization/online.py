@@ -40,7 +40,7 @@ from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
-LEAST_DIAGNOSED = 5.0  # s; of data, about a whole start: in less, every cause is as likely
+MIN_DIAGNOSED = 5.0  # s; of data, about a whole start: in less, every cause is as likely
 START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start uses
 
 
@@ -173,7 +173,7 @@ def _possible(
 ) -> tuple[Correction, ...]:
     """Return what may be wrong with the site, the most likely first."""
     span = float(np.ptp(log.imu.time)) if len(log.imu) else 0.0
-    if trust.verdict is Verdict.TRUSTWORTHY or span < LEAST_DIAGNOSED or site.platform.further:
+    if trust.verdict is Verdict.TRUSTWORTHY or span < MIN_DIAGNOSED or site.platform.further:
         return ()
     return tuple(
         corrections(site, trust.reasons, causes, diagnosed(log, site, trust, settings.lockin))

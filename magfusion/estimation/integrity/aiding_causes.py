@@ -13,7 +13,7 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.state import States, states_in
 from magfusion.estimation.integrity.explanation import CLEARLY, ENOUGH, MARGIN
-from magfusion.estimation.integrity.fault_candidates import LARGEST
+from magfusion.estimation.integrity.fault_candidates import MAX_SIZE
 from magfusion.estimation.integrity.fault_isolation import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.motion_causes import signed_permutations
 from magfusion.estimation.measurements.aiding import AidingMeasurement
@@ -262,7 +262,7 @@ def _of_points(
     starts = [sensor.point_world, *(p for p in known.values() if p is not None)]
     for point in _fitted_points(sensor, seen, np.array(starts)):
         moved = float(np.linalg.norm(point - sensor.point_world))
-        if moved > LARGEST[AIDING_POSITION]:  # a smaller error is a parameter
+        if moved > MAX_SIZE[AIDING_POSITION]:  # a smaller error is a parameter
             square, corrected = _at_point(sensor, seen, np.round(point, 3))
             words = f"its point is {moved:.3g} m from the declared one"
             yield square + MARGIN, _cause("aiding_point", words, corrected, sensor)

@@ -19,8 +19,8 @@ from magfusion.estimation.integrity.fault_candidates import (
     fault_candidates,
 )
 from magfusion.estimation.integrity.fixed_parameter_test import (
-    LEAST_EVIDENCE,
     MAX_LINEAR_CHI_SQUARE,
+    MIN_EVIDENCE,
 )
 from magfusion.estimation.integrity.released_fault import (
     COVERED,
@@ -51,9 +51,9 @@ from magfusion.units import DEGREE, Array, ComplexArray
 
 CHANGED = "changed"  # code
 PARTS = (0.25, 0.5, 0.75)  # of the log, times of the tested steps
-MOST_BEACONS = 12  # with more, the test is not made
+MAX_BEACONS = 12  # with more, the test is not made
 MIN_EPOCHS = 40  # epochs, for parts with enough information
-SHORTEST = 10.0  # s
+MIN_PART = 10.0  # s
 BUDGET = 1e-5  # of false alarms, besides half a per cent of all other tests together
 
 
@@ -133,10 +133,10 @@ def candidate_steps(result: Smoothed) -> list[Block]:
 def _steps_by_time(result: Smoothed) -> dict[float, list[Block]]:
     """Return them by time of the step (s)."""
     site, time = result.declared.site, result.fields.time
-    if not 1 < len(site.beacons) <= MOST_BEACONS or len(time) < MIN_EPOCHS:
+    if not 1 < len(site.beacons) <= MAX_BEACONS or len(time) < MIN_EPOCHS:
         return {}
     begin, length = float(time[0]), float(time[-1] - time[0])
-    if length < SHORTEST or len(result.graph.segments) > 1:
+    if length < MIN_PART or len(result.graph.segments) > 1:
         return {}
     return {begin + part * length: _blocks(site, begin + part * length) for part in PARTS}
 
@@ -198,7 +198,7 @@ def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestR
         release_fault(pose_cov, score, fault, information, gradient)
         for fault in (*_fault_candidates(own, size), pose)
     )
-    causes = [one for one in released if one is not None and one.gain > LEAST_EVIDENCE]
+    causes = [one for one in released if one is not None and one.gain > MIN_EVIDENCE]
     if not causes:
         return None
     cause = max(causes, key=lambda one: one.gain)

@@ -26,7 +26,7 @@ from magfusion.estimation.integrity.fault_candidates import (
 )
 from magfusion.estimation.integrity.fault_isolation import CAUSE_FIRST, Diagnosis
 from magfusion.estimation.integrity.fixed_parameter_test import (
-    LEAST_EVIDENCE,
+    MIN_EVIDENCE,
     amounts,
     error_in_words,
     finding_of,
@@ -45,7 +45,7 @@ from magfusion.units import Array
 T = TypeVar("T")
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
-MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
+MAX_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
 REFINED = " The remedy is refined by the inertial data."
 
 
@@ -179,7 +179,7 @@ def best_trial(
     others. `tried`: returns the trial of a correction, None where it has no solution.
     """
     waiting, best, continues = list(possible), None, False
-    for _ in range(MOST_SOLUTIONS):
+    for _ in range(MAX_SOLUTIONS):
         if not waiting:
             break
         correction = waiting.pop(0)
@@ -359,7 +359,7 @@ def open_rivals(
         known = combine.T @ information @ combine
         rest = combine.T @ gradient - known @ rival.size
         # Twice the increase of the cost from the estimate to that size.
-        return float(rest @ np.linalg.pinv(known) @ rest) > LEAST_EVIDENCE
+        return float(rest @ np.linalg.pinv(known) @ rest) > MIN_EVIDENCE
 
     return [rival for rival in correction.rivals if not is_refuted(rival)]
 

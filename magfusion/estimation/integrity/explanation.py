@@ -8,14 +8,14 @@ from scipy.special import expit
 
 from magfusion.model.site import Site
 
-LEAST_FALL = 60.0  # of chi square, that an explanation must bring
+MIN_DECREASE = 60.0  # of chi square, that an explanation must bring
 CLEARLY = 2.5  # times smaller than before must chi square be, and than with any other cause
 SIGNIFICANT = 60.0  # fall for each estimated parameter, in units of the remaining mean square
 PENALTY = 6.0  # of chi square, for each estimated parameter
 ENOUGH = 1.5  # times the degrees of freedom: the rest where all is explained
 # Survey errors may leave more than noise: this share of chi square before, but not more than errors
 # twice as large as declared (in chi square, times expected), or this share of a gross mistake's.
-LITTLE, MOST_LEFT, VERY_LITTLE = 0.04, 4.0, 0.004
+LITTLE, MAX_LEFT, VERY_LITTLE = 0.04, 4.0, 0.004
 SIMILAR = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 EQUAL = 1.0  # of chi square, which two answers of one kind may differ by
@@ -60,7 +60,7 @@ class Explanation:
     @property
     def clear(self) -> bool:
         """Whether it explains enough to be reported."""
-        by_survey = min(LITTLE * self.before, MOST_LEFT * self.expected)
+        by_survey = min(LITTLE * self.before, MAX_LEFT * self.expected)
         by_noise, of_gross = ENOUGH * self.expected, VERY_LITTLE * self.before
         enough = self.after < max(by_noise, by_survey, of_gross)
         # A bias or a lever arm that its prior holds back costs little, however certain it is.
@@ -69,11 +69,11 @@ class Explanation:
             self.parameter_count > 0 and self.fall / self.parameter_count > SIGNIFICANT * noise
         )
         clearly = self.before > CLEARLY * self.after or significant
-        return enough and self.fall > LEAST_FALL and clearly
+        return enough and self.fall > MIN_DECREASE and clearly
 
     def as_well_as(self, other: "Explanation") -> bool:
         """Return whether it leaves hardly more than another, or no more than is expected."""
-        return self.after < max(SIMILAR * other.after + LEAST_FALL / 2.0, self.expected)
+        return self.after < max(SIMILAR * other.after + MIN_DECREASE / 2.0, self.expected)
 
     def is_ambiguous_with(self, other: "Explanation") -> bool:
         """Return whether another would be another answer."""

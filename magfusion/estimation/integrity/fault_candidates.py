@@ -115,7 +115,7 @@ USUAL: dict[Parameter, float] = TOLERANCE | {
 }
 
 # What is larger is another mistake: a unit, an axis, gravity.
-LARGEST: dict[Parameter, float] = {
+MAX_SIZE: dict[Parameter, float] = {
     GYRO_BIAS: 0.5,
     ACCEL_BIAS: 1.5,
     GYRO_ALIGNMENT: 20.0 * DEGREE,

@@ -20,7 +20,7 @@ from magfusion.units import DEGREE, Array
 GROSS = 4.0  # chi square over its freedom, below which no mistake in all beacons is sought
 SCREENED = 6  # epochs on which each is tried
 KEPT = 4  # of them, tried on all epochs
-MOST_PERMUTED = 5  # beacons, of which three may be permuted in 20 ways
+MAX_PERMUTED = 5  # beacons, of which three may be permuted in 20 ways
 CORNERS = 12  # corner frequencies of a low-pass that are tried
 REACH = 1.0  # of the logarithm of a corner frequency, and of a delay in its radians
 REFINED = 1e-4  # of the logarithm of chi square; a step that decreases it by less is the last
@@ -244,7 +244,7 @@ def _exchanges(site: Site) -> Iterator[Way]:
     """Yield sites in which two beacons, or three in turn, are taken for each other."""
     count = len(site.beacons)
     orders: list[tuple[int, ...]] = [*combinations(range(count), 2)]
-    if count <= MOST_PERMUTED:
+    if count <= MAX_PERMUTED:
         for i, j, k in combinations(range(count), 3):
             orders += [(i, j, k), (i, k, j)]
     pose: tuple[str, ...] = ("position_world", "world_from_beacon")

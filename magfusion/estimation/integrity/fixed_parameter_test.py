@@ -31,13 +31,13 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array
 
-LEAST_EVIDENCE = 20.0  # of -2 log likelihood, above which a cause is named
+MIN_EVIDENCE = 20.0  # of -2 log likelihood, above which a cause is named
 MARGIN = 10.0  # of the same, by which a cause must be better than another
 MAX_LINEAR_CHI_SQUARE = (
     25.0**2
 )  # beyond, a linear step and its covariance do not locate the solution
 MAX_CAUSES = 4  # reported causes
-LEAST_SHARE = 0.03  # of the first cause's evidence; less may be its nonlinear remainder
+MIN_SHARE = 0.03  # of the first cause's evidence; less may be its nonlinear remainder
 UNCHECKED = 4.3**2  # chi square below which one of fifty candidates is not detected
 
 
@@ -107,7 +107,7 @@ def causes_of(
         )
         every = [one for one in released if one is not None and one.is_possible]
         largest = max((one.gain for one in every), default=0.0)
-        if largest < max(LEAST_EVIDENCE, LEAST_SHARE * first):
+        if largest < max(MIN_EVIDENCE, MIN_SHARE * first):
             return
         ranked = sorted(every, key=lambda one: -one.posterior_gain)
         cause = simplest(ranked)
@@ -156,7 +156,7 @@ def _exceeds_residuals(case: Case, score: Score, one: ReleasedFault, before: Arr
     after = moved_estimate(case.result, score, score.allowed(before + one.step))
     rest = field_residual(case.result, after)
     excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0
-    return one.gain / excess > LEAST_EVIDENCE
+    return one.gain / excess > MIN_EVIDENCE
 
 
 def finding_of(site: Site, cause: ReleasedFault, rivals: Sequence[ReleasedFault] = ()) -> Finding:

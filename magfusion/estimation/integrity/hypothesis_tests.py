@@ -41,10 +41,10 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
 
-LONGEST = 100.0  # s; of a longer log parts are tried
+MAX_DURATION = 100.0  # s; of a longer log parts are tried
 PARTS = 4
 MIN_EPOCHS = 8  # epochs
-LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
+MIN_TRAVEL = 0.3  # m; who goes less far sees each beacon from one side
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
 QUANTISED, LEFT_HANDED = "quantised", "magnetometer_axes"  # codes
 DISTORTION = 0.3  # of a step, in phasors: 1/sqrt(12) of each sample
@@ -193,7 +193,7 @@ def _of_fields(known: Snapshots, samples: FieldSamples, static: float | None) ->
 
 def _moves(known: Snapshots) -> bool:
     place = known.fixes.position_world[:, 0]
-    return float(np.max(np.ptp(place, axis=0))) > LEAST_WAY
+    return float(np.max(np.ptp(place, axis=0))) > MIN_TRAVEL
 
 
 def _of_motion(known: Snapshots, samples: FieldSamples, imu: ImuSamples) -> list[Explanation]:
@@ -246,13 +246,13 @@ def _delayed(shifted: Explanation, samples: FieldSamples, imu: ImuSamples) -> Ex
 def _part(log: Log) -> Log:
     """Return a log, or of a long one some parts of it."""
     first, last = float(log.imu.time[0]), float(log.imu.time[-1])
-    if last - first <= LONGEST:
+    if last - first <= MAX_DURATION:
         return log
-    begins = np.linspace(first, last - LONGEST / PARTS, PARTS)
+    begins = np.linspace(first, last - MAX_DURATION / PARTS, PARTS)
 
     def within(time: Array) -> BoolArray:
         elapsed = time[:, None] - begins
-        return np.asarray(np.any((elapsed >= 0.0) & (elapsed < LONGEST / PARTS), axis=1))
+        return np.asarray(np.any((elapsed >= 0.0) & (elapsed < MAX_DURATION / PARTS), axis=1))
 
     imu, wave, fields = log.imu, log.waveform, log.fields
     kept = within(imu.time)

@@ -46,7 +46,7 @@ from magfusion.model.without_imu import logged
 from magfusion.units import Array
 
 EXPLAINED = 0.3  # of the residuals; remaining share with a cause that explains them
-FEW = 2  # simultaneous causes
+MAX_CAUSES = 2  # simultaneous causes
 STRONGER = 1.5  # ratio above which a finding is no side effect of another
 
 
@@ -226,7 +226,7 @@ def _explained(case: Case, named: tuple[Array, ...]) -> tuple[tuple[GraphEstimat
 
     before = moved(np.zeros(len(score.gradient)))
     least = max(EXPLAINED * _square(result, before[0]), 1.0)
-    for number, step in enumerate(named[:FEW], 1):
+    for number, step in enumerate(named[:MAX_CAUSES], 1):
         after = moved(step)
         if _square(result, after[0]) < least:
             return after, len(named) if number == len(named) else number

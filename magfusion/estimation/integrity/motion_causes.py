@@ -15,7 +15,7 @@ from magfusion.estimation.integrity.corrected_site import (
     with_magnetometer,
 )
 from magfusion.estimation.integrity.explanation import CLEARLY, Explanation
-from magfusion.estimation.integrity.fault_candidates import LARGEST
+from magfusion.estimation.integrity.fault_candidates import MAX_SIZE
 from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, Surveyed, compared
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.files.site_plain import rpy_deg
@@ -38,7 +38,7 @@ ACCEL_UNITS = {
     "in mm/s^2": 1e-3,
 }
 MAX_DELAY = 3.0  # s
-LARGEST_DRIFT = 0.1  # s, that two streams drift apart; a window is a few tenths long
+MAX_DRIFT = 0.1  # s, that two streams drift apart; a window is a few tenths long
 PARTS = 4  # of a log, in each of which a delay is sought
 DOUBT_SIGMAS = 3.0  # sigmas of a declared time offset
 EYE = np.eye(3)
@@ -170,7 +170,7 @@ def _released(known: Compared, before: float, site: Site) -> Iterator[Explanatio
     )
     for sensor, unit, bias in (("gyro", "rad/s", GYRO_BIAS), ("accel", "m/s^2", ACCEL_BIAS)):
         after, estimate = known.explained(EYE, EYE, parameters=sensor)
-        if np.max(np.abs(estimate[SHARED[sensor]])) > LARGEST[bias]:
+        if np.max(np.abs(estimate[SHARED[sensor]])) > MAX_SIZE[bias]:
             continue
         yield Explanation(
             "imu_bias",
@@ -364,7 +364,7 @@ def _on_clock(site: Site, stamps: Array, rate: float, start: float) -> Site | No
 
     Of the streams, only the constant part of a declared offset is corrected.
     """
-    if abs(rate) * (stamps[-1] - stamps[0]) > LARGEST_DRIFT:
+    if abs(rate) * (stamps[-1] - stamps[0]) > MAX_DRIFT:
         return None
     clock = site.platform.imu
     late = (start + rate * (stamps[0] + clock.time_offset)) / (1.0 + rate)

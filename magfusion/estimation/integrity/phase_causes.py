@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from magfusion.estimation.integrity.corrected_site import with_magnetometer, with_phases
-from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
+from magfusion.estimation.integrity.explanation import CLEARLY, MIN_DECREASE, Explanation
 from magfusion.estimation.integrity.field_causes import left_handed
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -18,14 +18,14 @@ from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
 
 TWO_PI = 2.0 * np.pi
-LONGEST_SHIFT = 0.5  # s; an epoch that is farther off is known up to a common period of the tones
+MAX_SHIFT = 0.5  # s; an epoch that is farther off is known up to a common period of the tones
 SHIFT_STEP = 2e-4  # s
 RATE_REACH = 0.02  # relative; clocks that are farther off are not sought
 COMMON = 0.2  # spread of relative rates, of their mean, that is one clock's
 STILL = 2e-6  # relative rate that is none
 REVERSED = 0.1  # rad, that a phase may be off a half turn
 SIMILAR = 0.7  # of the chi square of constant phases, that those of other clocks may leave
-LARGEST_ADVANCE = 60.0 * DEGREE  # rad; beyond, a coil is reversed or in the wrong quadrature
+MAX_ADVANCE = 60.0 * DEGREE  # rad; beyond, a coil is reversed or in the wrong quadrature
 DENSE = 60  # neighbouring epochs that determine a rate
 
 
@@ -38,7 +38,7 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
         return
     loose = fix_epochs(known.samples, known.calibration, free_parameters=("phase",))
     lower = float(np.sum(loose.cost[:, 0]))
-    if known.chi_square - lower < LEAST_FALL or known.chi_square < CLEARLY * lower:
+    if known.chi_square - lower < MIN_DECREASE or known.chi_square < CLEARLY * lower:
         return
     tones_hz = known.site.tone_frequencies_hz
     rate = _rates(known, every, tones_hz)
@@ -47,7 +47,7 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     constant = _rotated(known, mean)
     if rate is not None and np.max(np.abs(rate)) > STILL:
         clocks = list(_of_clocks(known, phase, rate, tones_hz))
-        if all(one.after < SIMILAR * constant.chi_square - LEAST_FALL for one in clocks):
+        if all(one.after < SIMILAR * constant.chi_square - MIN_DECREASE for one in clocks):
             yield from clocks
             return
     shift = _shift(mean, tones_hz)
@@ -68,7 +68,8 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
         yield _explanation(known, _rotated(known, np.full(len(mean), np.pi)), 0, *left_handed())
     elif (
-        not _wired(known, mean) and constant.chi_square < SIMILAR * shifted.chi_square - LEAST_FALL
+        not _wired(known, mean)
+        and constant.chi_square < SIMILAR * shifted.chi_square - MIN_DECREASE
     ):
         yield _of_each(known, constant, mean)
 
@@ -221,7 +222,7 @@ def _free_running(site: Site, rates: Mapping[str, float]) -> Site:
 
 def _shift(phase: Array, tones_hz: Array) -> float:
     """Return the delay (s) that phases show, the shortest of those that explain them equally."""
-    trial = np.arange(-LONGEST_SHIFT, LONGEST_SHIFT, SHIFT_STEP)
+    trial = np.arange(-MAX_SHIFT, MAX_SHIFT, SHIFT_STEP)
     rotated = np.exp(1j * (phase + TWO_PI * tones_hz * trial[:, None]))
     agreement = np.real(np.sum(rotated, axis=1))
     near = np.flatnonzero(agreement > np.max(agreement) - 0.02)
@@ -250,9 +251,7 @@ def coil_phase(
     for k, coil in enumerate(beacon.coils):
         if tones[coil.frequency_hz, coil.slot] < 2:
             continue
-        angle, _ = minimise_between(
-            partial(cost, k), -LARGEST_ADVANCE, LARGEST_ADVANCE, 0.1 * DEGREE
-        )
+        angle, _ = minimise_between(partial(cost, k), -MAX_ADVANCE, MAX_ADVANCE, 0.1 * DEGREE)
         after = trial(advanced(k, angle))
         result = _explanation(
             known,

@@ -18,7 +18,7 @@ from magfusion.estimation.integrity.fault_candidates import (
     FaultCandidate,
     survey_tilt,
 )
-from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
+from magfusion.estimation.integrity.fixed_parameter_test import MIN_EVIDENCE
 from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
@@ -90,7 +90,7 @@ def _tilt(case: Case, change: Array, cov: Array) -> ReleasedFault | None:
         distance=np.zeros(count),
     )
     explains_all = float(residual @ residual) - gain < TOLERATED * len(residual)
-    return cause if explains_all and cause.posterior_gain > LEAST_EVIDENCE else None
+    return cause if explains_all and cause.posterior_gain > MIN_EVIDENCE else None
 
 
 def _whitening(cov: Array) -> Array:

@@ -46,7 +46,7 @@ TOLERATED_CODES = frozenset({"samples_lost"})  # handled by every estimator
 # Causes of a log without any usable window.
 CORRUPTING_CODES = frozenset({"saturated", "jitter", "gap", "samples_lost", "frozen_magnetometer"})
 DOUBT = Verdict.DOUBTFUL
-LEAST_BAD = 3  # unexplained epochs
+MIN_UNEXPLAINED = 3  # unexplained epochs
 NOTHING_EXPLAINED = 30.0  # residual from which the fixes are useless
 FIX_PROBABILITY = 0.95  # probability of a fix that is compared with gravity and static field
 UNEXPLAINED = 3.0  # residual of the fixes, one where noise, model and survey are as declared
@@ -207,7 +207,7 @@ def findings_of_fit(fixes: Fixes) -> list[Finding]:
                 20.0 + median,
             )
         ]
-    if np.sum(bad) < LEAST_BAD:
+    if np.sum(bad) < MIN_UNEXPLAINED:
         return []
     time = fixes.time[bad]
     return [

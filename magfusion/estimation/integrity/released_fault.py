@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
-from magfusion.estimation.integrity.fault_candidates import LARGEST, USUAL, FaultCandidate
+from magfusion.estimation.integrity.fault_candidates import MAX_SIZE, USUAL, FaultCandidate
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.parameters import AidingParameter
 from magfusion.model.parameters.inertial import GRAVITY, Inertial
@@ -56,7 +56,8 @@ class ReleaseGain:
     def is_possible(self) -> bool:
         """Whether no parameter is moved by more than it may be."""
         return all(
-            float(np.max(np.abs(b.sigma * self.step[b.columns]))) < LARGEST.get(b.parameter, np.inf)
+            float(np.max(np.abs(b.sigma * self.step[b.columns])))
+            < MAX_SIZE.get(b.parameter, np.inf)
             for b in self.fault.blocks
         )
 

@@ -36,12 +36,12 @@ from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.snapshot.priors import NOTHING_EXPLAINED
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.windows import LONGEST_WINDOW
+from magfusion.receiver.windows import MAX_WINDOW
 from magfusion.units import Array, BoolArray
 
-BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are tested separately
+BLOCK, MAX_BLOCKS = 10.0, 24  # s; stretches that are tested separately
 SHORT_BLOCK = 2.0  # s; all beacons together: as long as iron takes to pass one
-MOST_SHORT = 1800  # of them, in an hour
+MAX_BLOCKS_PER_HOUR = 1800  # of them, in an hour
 INDEPENDENT = 3.0  # of a phasor's six numbers: one model error affects several
 TOLERATED = 1.2**2  # mean square below which sigmas are acceptable
 TOLERATED_INERTIAL = 1.5**2
@@ -66,7 +66,7 @@ class Misfit(NamedTuple):
     whole: bool  # whether the stretch is the whole log
 
 
-def blocks_of(time: Array, block: float = BLOCK, maximum: int = MOST_BLOCKS) -> list[BoolArray]:
+def blocks_of(time: Array, block: float = BLOCK, maximum: int = MAX_BLOCKS) -> list[BoolArray]:
     """Return the stretches of a log, the whole of it first; of a length (s), or as many."""
     length = float(time[-1] - time[0])
     count = int(np.clip(length / block, 1, maximum))
@@ -213,7 +213,10 @@ def _unexplained(case: Case, raw: Array, weighed: Array) -> Array:
     time = case.result.fields.time
     used = np.any(raw != 0.0, axis=2)  # an excluded beacon has no weight at all
     rejected = np.sum(weighed**2, axis=2) < LEFT_OUT * np.sum(raw**2, axis=2)
-    short, every = blocks_of(time, SHORT_BLOCK, MOST_SHORT), np.where(used[..., None], raw, np.nan)
+    short, every = (
+        blocks_of(time, SHORT_BLOCK, MAX_BLOCKS_PER_HOUR),
+        np.where(used[..., None], raw, np.nan),
+    )
     accepted = np.where(rejected[..., None], np.nan, every)
     tests = misfits("", accepted, short[1:] or short, INDEPENDENT * raw.shape[1])
     rows = [one.rows for one in _significant(tests, TOLERATED) if np.any(rejected[one.rows])]
@@ -309,7 +312,7 @@ def together(case: Case) -> TestResult:
         return NOTHING
     residual = graph.residual(measured, case.result.estimate)
     square = np.mean(residual**2, axis=(1, 2))
-    piece = np.floor((measured.time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    piece = np.floor((measured.time - measured.time[0]) / MAX_WINDOW).astype(np.int64)
     count = np.bincount(piece)
     mean = np.bincount(piece, square) / np.maximum(count, 1)
     mean = np.where(count >= MIN_WINDOWS, mean, np.mean(square))
@@ -317,7 +320,7 @@ def together(case: Case) -> TestResult:
     if worst <= EXPLAINED_SQUARE:
         return NOTHING
     time = case.result.states.time
-    at = np.floor((time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    at = np.floor((time - measured.time[0]) / MAX_WINDOW).astype(np.int64)
     factor = np.maximum(mean[np.clip(at, 0, len(mean) - 1)], 1.0)
     rms, share = np.sqrt(worst), 100.0 * float(np.mean(mean > EXPLAINED_SQUARE))
     finding = Finding(

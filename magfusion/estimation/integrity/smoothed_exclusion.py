@@ -27,12 +27,12 @@ from magfusion.units import Array, BoolArray, IntArray
 UNEXPECTED = 1e-4  # probability of a larger deviation of a field from the others' prediction
 JOINED = 1.0  # s; a shorter gap between two false stretches is false too
 BETTER = 0.8  # of the largest separation, above which an exclusion has not explained it
-MOST_FALSE = 0.9  # share of a log; a beacon that is false for longer is declared wrongly
+MAX_FALSE = 0.9  # share of a log; a beacon that is false for longer is declared wrongly
 LEFT_OUT = 0.1  # robust weight below which a field does not count
 ROUNDS = 3  # of exclusions
 TOGETHER = 3.0  # s; closer stretches are reported as one
 MIN_LEFT_OUT_EPOCHS = 5  # excluded field epochs of a beacon that are reported; fewer are outliers
-LONGEST_EXCLUSION = 5.0  # s of a beacon; after more, other findings are its traces
+MAX_EXCLUSION = 5.0  # s of a beacon; after more, other findings are its traces
 EXCLUDED_FIRST = 1e5  # weight
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
@@ -96,7 +96,7 @@ def _without_false(
             break
         beacon = int(np.argmin(np.mean(separated.cost + 2.0 * separated.rows, axis=0)))
         false = _false_stretches(result, separated, beacon)
-        if not np.any(false & ~out[:, beacon]) or np.mean(false) > MOST_FALSE:
+        if not np.any(false & ~out[:, beacon]) or np.mean(false) > MAX_FALSE:
             break
         trial = _resolved(result, names[beacon], false)
         again = None if trial is None else separate_smoothed(trial)
@@ -224,7 +224,7 @@ def _without_weight(result: Smoothed, names: tuple[str, ...]) -> BoolArray:
     for j in range(len(names)):
         own = np.any(weight[:, owner == j] < LEFT_OUT, axis=1)
         # A beacon that is always rejected is declared wrongly, which other tests report.
-        out[:, j] = own & (np.mean(own) <= MOST_FALSE)
+        out[:, j] = own & (np.mean(own) <= MAX_FALSE)
     return out
 
 
@@ -263,7 +263,7 @@ def _excluded_findings(
             f"{time[a]:.1f} to {time[b]:.1f} s"
             for a, b in _stretches(np.flatnonzero(out[:, j]), time)
         ]
-        lasting = float(np.sum(out[:, j]) * np.median(np.diff(time))) > LONGEST_EXCLUSION
+        lasting = float(np.sum(out[:, j]) * np.median(np.diff(time))) > MAX_EXCLUSION
         more = f" and {len(spans) - LISTED} more times" if len(spans) > LISTED else ""
         findings.append(
             Finding(
@@ -287,7 +287,7 @@ def excluded_to_the_end(separated: SeparatedSmooth) -> dict[str, float]:
         if not len(out):
             continue
         first, last = _stretches(out, time)[-1]
-        lasting = time[last] - time[first] > LONGEST_EXCLUSION
+        lasting = time[last] - time[first] > MAX_EXCLUSION
         if lasting and first > 0 and time[-1] - time[last] < TOGETHER:
             onsets[beacon.name] = float(time[first])
     return onsets

@@ -50,7 +50,7 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import MU0, Array
 
 SHARED, OWN, PLACES = 400, 30, 150  # modes of a map: of all beacons, and of each tone
-LEAST_BEACONS = 4  # without one, three determine the pose
+MIN_BEACONS = 4  # without one, three determine the pose
 MOVED = Finding(
     "steel_moved",
     "The log is explained better without the map of steel in its site: steel was moved, or the map"
@@ -58,7 +58,7 @@ MOVED = Finding(
     " or omit world.steel.",
     Verdict.TRUSTWORTHY,
 )
-LEAST_SIZE = 0.5  # of the distortion, from which the variances of voxels are sought
+MIN_SIZE = 0.5  # of the distortion, from which the variances of voxels are sought
 
 
 class SteelMap(NamedTuple):
@@ -180,8 +180,8 @@ def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | str:
     `result`: as estimated without a map. `imu`: as recorded.
     """
     site = result.calibration.site
-    if len(site.beacons) < LEAST_BEACONS:
-        return f"it needs {LEAST_BEACONS} beacons, the log has {len(site.beacons)}"
+    if len(site.beacons) < MIN_BEACONS:
+        return f"it needs {MIN_BEACONS} beacons, the log has {len(site.beacons)}"
     if has_close_tones(result):
         return "its tones are too close to be received apart"
     if site.platform.further:
@@ -219,7 +219,7 @@ def _sparse(score: Score, sigma: Array, site: Site) -> tuple[Score, Array]:
     alone = replace(score, spread=np.concatenate([score.spread, spread], axis=1))
     information, gradient = amplitude_evidence(alone)
     evidence = information[shared, shared], gradient[shared]
-    variance = voxel_variances(basis, *evidence, max(float(sigma[0]), LEAST_SIZE))
+    variance = voxel_variances(basis, *evidence, max(float(sigma[0]), MIN_SIZE))
     few = _with_basis(score, *with_variances(basis, site, variance))
     is_shared = np.arange(len(block_of(few).sigma)) < basis_of(few).shared
     return few, best_size(*amplitude_evidence(few), is_shared)[1]

@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.integrity.fault_candidates import fault_candidates
-from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, MARGIN
+from magfusion.estimation.integrity.fixed_parameter_test import MARGIN, MIN_EVIDENCE
 from magfusion.estimation.integrity.hypothesis_tests import world_model_error
 from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
@@ -99,7 +99,7 @@ def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | No
     parameter would explain anything.
     """
     rival = max(rival, _best_parameter(case))
-    if rival < LEAST_EVIDENCE and not doubted:
+    if rival < MIN_EVIDENCE and not doubted:
         return None
     if case.in_region is None:
         estimate = estimate_steel(case, rival)
@@ -202,7 +202,7 @@ def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
     block = block_of(score)
     shared = np.arange(len(block.sigma)) < basis_of(score).shared
     gain, sigma = best_size(*amplitude_evidence(score), shared)
-    if gain < max(rival + MARGIN, LEAST_EVIDENCE) or np.max(sigma) >= SIZES[-1]:
+    if gain < max(rival + MARGIN, MIN_EVIDENCE) or np.max(sigma) >= SIZES[-1]:
         return None  # the largest size stands for gross mistakes that no mode explains
     return gain, sigma
 

@@ -14,7 +14,7 @@ from magfusion.estimation.measurements.point_position import PointPosition
 from magfusion.estimation.measurements.point_range import PointRange
 from magfusion.estimation.measurements.relative_pose import RelativePose, relative_pose
 from magfusion.model.aiding import (
-    LONGEST_INTERVAL,
+    MAX_INTERVAL,
     AidingSamples,
     AidingSensor,
     Quantity,
@@ -116,7 +116,7 @@ def _has_inertial(
     there = np.isfinite(whole.sigma[:, 0])
     if not there.any():
         raise InputError(
-            f"{sensor.name}: none of its {len(time)} intervals has at most {LONGEST_INTERVAL:g} s"
+            f"{sensor.name}: none of its {len(time)} intervals has at most {MAX_INTERVAL:g} s"
             " and all its inertial samples; give poses relative to a nearer keyframe"
         )
     return np.asarray(there)

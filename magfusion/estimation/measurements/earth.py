@@ -40,7 +40,7 @@ DISTURBED = 0.25  # weight below which the field is reported as disturbed
 GATE = 16.3  # chi square of three components, one in a thousand
 AMBIENT_TIME = 2.0  # s; over which it is constant
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's magnitude is averaged
-LEAST_HORIZONTAL = 1e-6  # T; less gives no heading
+MIN_HORIZONTAL = 1e-6  # T; less gives no heading
 ANYWHERE, ANY_ROTATION = 100.0, 10.0  # m, rad; of a platform that never detected a beacon
 SPEED_TIME = 2.0  # s; in which the speed counts once if no beacon is detected
 
@@ -137,7 +137,7 @@ def check_earth(site: Site) -> None:
             "the site has no Earth field to measure against; give earth_field_t or a location in"
             " its world, or leave --earth out"
         )
-    if np.hypot(field[0], field[1]) < LEAST_HORIZONTAL or not gravity > 0.0:
+    if np.hypot(field[0], field[1]) < MIN_HORIZONTAL or not gravity > 0.0:
         raise InputError(
             f"the site's Earth field has only {1e6 * np.hypot(field[0], field[1]):.2g} uT in the"
             " horizontal plane, too little to determine a heading; leave --earth out"

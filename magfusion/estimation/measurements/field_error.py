@@ -30,7 +30,7 @@ SPATIAL = 48  # modes of place, of which combinations are selected
 EPOCHS = 1000  # by which they are selected
 AXES = 3
 AT_ONCE = 5e8  # bytes of their Jacobian, in a long log
-MOST_CELLS = 1000
+MAX_CELLS = 1000
 
 
 class FieldError(BeaconParameter):
@@ -134,7 +134,7 @@ def modes_in_place(position_world: Array, length: float, maximum: int) -> Array:
     `position_world` (n, 3) (m), `length` (m). `maximum`: maximum number of modes.
     """
     size, (owner, members, centre) = 1.0, cells(position_world, length)
-    while len(centre) > MOST_CELLS:
+    while len(centre) > MAX_CELLS:
         size *= 2.0
         owner, members, centre = cells(position_world, size * length)
     separate = np.linalg.norm(centre[:, None] - centre, axis=2)

@@ -12,7 +12,7 @@ from magfusion.units import Array
 BY_DISTANCE, BY_ROTATION = 6.0, 0.5
 # Of the noise.  The deviation is not zero in the mean: that of a platform at rest is the same in
 # thousands of epochs, of which it must be no signal.
-LARGEST_DEVIATION = 0.02  # sigma
+MAX_DEVIATION = 0.02  # sigma
 MAX_ITERATIONS = 10
 
 
@@ -20,7 +20,7 @@ def is_curved(phasors: FieldPhasors, predicted: State) -> bool:
     """Return whether an epoch's fields are nonlinear over the uncertainty of its prediction."""
     cov = predicted.cov
     rotated, shifted = np.trace(cov[ROTATION, ROTATION]), np.trace(cov[POSITION, POSITION])
-    return _deviation(phasors, rotated, shifted, _nearest(predicted)) > LARGEST_DEVIATION
+    return _deviation(phasors, rotated, shifted, _nearest(predicted)) > MAX_DEVIATION
 
 
 def relinearized(
@@ -42,7 +42,7 @@ def relinearized(
         before, pose = pose, predicted.pose.retract(step)
         moved = before.localCoordinates(pose)
         rotated, shifted = np.sum(moved[ROTATION] ** 2), np.sum(moved[POSITION] ** 2)
-        if _deviation(result, rotated, shifted, nearest) < LARGEST_DEVIATION:
+        if _deviation(result, rotated, shifted, nearest) < MAX_DEVIATION:
             return result
     return None
 

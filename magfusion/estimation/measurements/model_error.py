@@ -18,7 +18,7 @@ from magfusion.model.noise import model_error
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
 
-LONGEST_REST = 20.0  # s; online, no more is shared: the state has moved on
+MAX_REST = 20.0  # s; online, no more is shared: the state has moved on
 CELLS = 4.0  # per length, in which epochs are counted together
 CHUNK = 1_000_000  # pairs at a time
 
@@ -59,7 +59,7 @@ def epochs_sharing_error_online(speed: float, step: float, length: float) -> flo
     """
     if length <= 0.0:
         return 1.0
-    moved = max(speed * step / length, 2.0 * step / LONGEST_REST)
+    moved = max(speed * step / length, 2.0 * step / MAX_REST)
     return float(1.0 / np.tanh(0.5 * moved))
 
 

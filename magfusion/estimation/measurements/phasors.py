@@ -29,7 +29,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-MANY_COLUMNS = 64  # of parameters, most of which belong to one beacon
+MIN_SPARSE_COLUMNS = 64  # of parameters, most of which belong to one beacon
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class FieldPhasors(Measurement):
 
     def _whitened(self, by_blocks: Array, site: Site, blocks: tuple[Block, ...]) -> Array:
         """Return whitened columns of blocks; of many, only those that affect each channel."""
-        if by_blocks.shape[-1] < MANY_COLUMNS:
+        if by_blocks.shape[-1] < MIN_SPARSE_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
         out, root = np.zeros(by_blocks.shape), self.sqrt_information
         detected = np.flatnonzero(np.any(root, axis=(0, 2, 3))).tolist()

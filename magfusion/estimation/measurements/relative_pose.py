@@ -24,7 +24,7 @@ from magfusion.estimation.graph.preintegration import (
 )
 from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.aiding import AidingMeasurement, Prediction
-from magfusion.model.aiding import LONGEST_INTERVAL, AidingSamples, AidingSensor
+from magfusion.model.aiding import MAX_INTERVAL, AidingSamples, AidingSensor
 from magfusion.model.parameters import AIDING_POSITION, AIDING_ROTATION, AIDING_SCALE
 from magfusion.model.perturbation import skew
 from magfusion.model.samples import ImuSamples
@@ -89,7 +89,7 @@ class RelativePose(AidingMeasurement):
             sigma=np.hypot(self.noise, self._inertial_noise(model, site.gravity)),
             **{k: getattr(self, k).copy() for k in ("rotated", "gained", "passed", "by_bias")},
         )
-        own.sigma[self.interval > LONGEST_INTERVAL * (1.0 + ROUNDING)] = np.inf
+        own.sigma[self.interval > MAX_INTERVAL * (1.0 + ROUNDING)] = np.inf
         if len(imu) < 2:
             own.sigma[:] = np.inf
             return own
@@ -223,7 +223,7 @@ def relative_pose(
 def longest_interval(site: Site) -> float:
     """Return how long before a state inertial samples may be needed (s); zero without a sensor."""
     needed = any(sensor.quantity == "relative_pose" for sensor in site.aiding)
-    return LONGEST_INTERVAL + RATE_SPAN if needed else 0.0
+    return MAX_INTERVAL + RATE_SPAN if needed else 0.0
 
 
 def _times(matrix: Array, vector: Array) -> Array:

@@ -40,7 +40,7 @@ MAX_MOMENTS = 5e7  # numbers, .4 GB; the path of a wrong estimate may span kilom
 REGION_SHARED, REGION_OWN = 40, 3  # the same of a region
 REGION_EDGE, MAX_VOXELS = 1.0, 600  # m; coarser voxels where there would be more
 REGION_MARGIN = 1.0  # m; of places around beacons in a plane, and of voxels
-REGION_ROWS, LEAST_PLACES = 160, 10  # places times tones, at which its modes are determined
+REGION_ROWS, MIN_PLACES = 160, 10  # places times tones, at which its modes are determined
 SOFTENING = 0.5  # of the edge
 LOW_DISCREPANCY = np.array([0.8191725, 0.6710436, 0.5497005])  # of an additive recurrence
 ROOT = np.sqrt(0.5)
@@ -220,7 +220,7 @@ def _region_basis(site: Site) -> SteelBasis | None:
     low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
     if site.region is not None and (box := site.region.box_world) is not None:
         low, high = (np.where(np.isfinite(b), b, e) for b, e in zip(box, (low, high), strict=True))
-    count = max(REGION_ROWS // len(site.channels), LEAST_PLACES)
+    count = max(REGION_ROWS // len(site.channels), MIN_PLACES)
     place = low + (high - low) * (np.arange(1, count + 1)[:, None] * LOW_DISCREPANCY % 1.0)
     place = place[cKDTree(beacon).query(place)[0] > CLEAR]
     low, high, edge = low - REGION_MARGIN, high + REGION_MARGIN, REGION_EDGE

@@ -15,7 +15,7 @@ from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, IntArray
 
-LONGEST_MEAN = 2.0  # s
+MAX_MEAN = 2.0  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ def zero_rate(
     if len(time) == 0 or len(imu) == 0:
         return None
     gap = np.diff(time, prepend=-np.inf, append=np.inf)
-    half = 0.5 * np.minimum(LONGEST_MEAN, np.minimum(gap[:-1], gap[1:]))
+    half = 0.5 * np.minimum(MAX_MEAN, np.minimum(gap[:-1], gap[1:]))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro_body, axis=0)])
     begin, end = np.maximum(time - half, within[0]), np.minimum(time + half, within[1])
     first, last = (np.searchsorted(imu.time, one - time_offset) for one in (begin, end))
@@ -62,7 +62,7 @@ def zero_rate(
         return None
     count = (last - first)[some]
     mean = (total[last] - total[first])[some] / count[:, None]
-    step = float(np.median(np.diff(imu.time))) if len(imu) > 1 else LONGEST_MEAN
+    step = float(np.median(np.diff(imu.time))) if len(imu) > 1 else MAX_MEAN
     return ZeroRate(epoch[some], mean, noise / np.sqrt(count * step))
 
 

@@ -13,7 +13,7 @@ from magfusion.model.strapdown import resting
 from magfusion.units import Array, BoolArray, IntArray
 
 REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
-LONGEST_SILENCE = 0.1  # s; a gap looks quiet
+MAX_SILENCE = 0.1  # s; a gap looks quiet
 MIN_SAMPLES = 10
 REACH = 0.1  # s, beyond the span, that the samples should cover
 _EYE = np.eye(3)
@@ -54,7 +54,7 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
     first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
     covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
     silent = np.zeros(count, dtype=np.int64)
-    gap = time[1:] - time[:-1] > LONGEST_SILENCE
+    gap = time[1:] - time[:-1] > MAX_SILENCE
     if gap.any():
         gap.cumsum(out=silent[1:])
     middle = np.minimum(np.searchsorted(time, stamps - span / 2), count - 1)

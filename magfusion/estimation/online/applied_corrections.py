@@ -17,8 +17,8 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array
 
 Size = tuple[float, float]  # of attitude (rad) and position (m)
-LONGEST_WAIT = 600.0  # s; between corrections, doubled each time: a hundredth of the processor
-MOST_MISTAKES = 2  # undone together; with more, the site is another one
+MAX_WAIT = 600.0  # s; between corrections, doubled each time: a hundredth of the processor
+MAX_MISTAKES = 2  # undone together; with more, the site is another one
 
 
 class AppliedCorrections:
@@ -50,9 +50,9 @@ class AppliedCorrections:
 
     def due(self, now: float) -> bool:
         """Return whether another correction may be tried at a time (s), and note that it is."""
-        if now < self._next or len(self.findings) >= MOST_MISTAKES:
+        if now < self._next or len(self.findings) >= MAX_MISTAKES:
             return False
-        self._next, self._wait = now + self._wait, min(2.0 * self._wait, LONGEST_WAIT)
+        self._next, self._wait = now + self._wait, min(2.0 * self._wait, MAX_WAIT)
         return True
 
     def further(

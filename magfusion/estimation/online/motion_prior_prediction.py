@@ -6,7 +6,7 @@ from magfusion.estimation.graph.dead_reckoning_error import step_noise, step_tra
 from magfusion.estimation.online.propagated import Passage
 from magfusion.model.platform_motion import ImuModel
 from magfusion.model.strapdown_steps import steps_of
-from magfusion.model.without_imu import LONGEST_STEP
+from magfusion.model.without_imu import MAX_STEP
 from magfusion.units import Array
 
 
@@ -16,7 +16,7 @@ def ahead_by_prior(passage: Passage, horizon: float, imu: ImuModel) -> Passage:
     Without a stream the error of a prediction cannot be measured: it follows from the prior.
     `horizon` (s). `imu`: of `magfusion.model.without_imu.on_motion_prior`.
     """
-    count = max(1, int(np.ceil(horizon / LONGEST_STEP - 1e-9)))
+    count = max(1, int(np.ceil(horizon / MAX_STEP - 1e-9)))
     length = np.full(len(passage), horizon / count)
     rotated = steps_of(passage.gyro_body, passage.accel_body, length)
     rotation, position = passage.world_from_body, passage.position_world

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP, check_clock
+from magfusion.estimation.data_checks.stream_buffer import MAX_JUMP, check_clock
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.online import NoStart
@@ -346,7 +346,7 @@ class Navigator:
 
     def is_after_silence(self, time: float) -> bool:
         """Return whether all streams were silent for so long before a time (s) that it restarts."""
-        return -np.inf < self.newest < time - LARGEST_JUMP
+        return -np.inf < self.newest < time - MAX_JUMP
 
     # Corrections
 

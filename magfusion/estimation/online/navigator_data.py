@@ -53,8 +53,8 @@ MEASUREMENTS: tuple[type[Measurement], ...] = (
     PoseFix,
     *OF_AIDING.values(),
 )
-LARGEST_OFFSET = 1e5  # s, of the IMU's stamps
-SHORTEST_INTERVAL = 1e-5  # s, of inertial samples
+MAX_OFFSET = 1e5  # s, of the IMU's stamps
+MIN_INTERVAL = 1e-5  # s, of inertial samples
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 
@@ -229,9 +229,9 @@ def _check_buffer(buffer: Buffer) -> None:
 
 
 def _check_inertial(stream: InertialStream) -> None:
-    require(abs(stream.offset) < LARGEST_OFFSET, "has an invalid offset")
+    require(abs(stream.offset) < MAX_OFFSET, "has an invalid offset")
     usual = stream.usual
-    require(usual is None or SHORTEST_INTERVAL <= usual < np.inf, "has an invalid interval")
+    require(usual is None or MIN_INTERVAL <= usual < np.inf, "has an invalid interval")
 
 
 def _check_window(window: SlidingWindow) -> None:

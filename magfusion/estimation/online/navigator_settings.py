@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from magfusion.estimation.batch.preprocessed_log import LONGEST_STEP
+from magfusion.estimation.batch.preprocessed_log import MAX_STEP
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.model.short_repr import short_repr
 from magfusion.model.trust import Risk
@@ -54,7 +54,7 @@ class NavigatorSettings(EstimatorSettings):
     lag: float = 4.0
     delay: float = 0.0
     start_duration: float = 6.0
-    longest_step: float = LONGEST_STEP
+    longest_step: float = MAX_STEP
     risk: Risk | None = None
     rate: Rate = "field"
     horizon: float = 0.0

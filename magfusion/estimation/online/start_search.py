@@ -19,7 +19,9 @@ from magfusion.model.parameters import Block
 from magfusion.model.site import Site
 
 MARGIN = 0.5  # s; of a span that a start uses
-LONGEST = 4.0  # durations of a start; as much is kept, and an open hypothesis waits so long
+MAX_START_DURATIONS = (
+    4.0  # durations of a start; as much is kept, and an open hypothesis waits so long
+)
 
 
 class StartSearch:
@@ -61,9 +63,9 @@ class StartSearch:
         if isinstance(start, NoStart):
             self.why = replace(start, corrections=())  # tried at once; a checkpoint has none
             self.needed *= 2.0 if start.trust.findings else 1.5
-            arrived.limit_history(LONGEST * usual)
+            arrived.limit_history(MAX_START_DURATIONS * usual)
             return None
-        if is_open(start) and self.needed < LONGEST * usual:
+        if is_open(start) and self.needed < MAX_START_DURATIONS * usual:
             self.why = open_start(start)
             self.needed += 0.5 * usual
             return None

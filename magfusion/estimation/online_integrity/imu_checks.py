@@ -11,7 +11,7 @@ from magfusion.estimation.online_integrity.running import DecayingSums
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 
-LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
+MIN_SPAN = 1.0  # s; of inertial data, before gravity is tested
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
 START_SPAN = 6.0  # s; of the data before the first state, over which a bias walks, too
 TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
@@ -59,7 +59,7 @@ def judge_gravity(site: Site, residual: DecayingSums, memory: float) -> Judgemen
     its time constant (s).
     """
     span = residual.weight  # s of data, without the gaps of the IMU
-    if span < LEAST_SPAN or not site.platform.inertial:
+    if span < MIN_SPAN or not site.platform.inertial:
         return Judgement()
     remaining = float(np.linalg.norm(residual.mean))
     motion, imu = site.platform.motion, site.platform.imu

@@ -43,14 +43,14 @@ PASSING = {
     "separation",
 }
 RESTARTS_MEMORY = 60.0  # s
-LEAST_EXCESS = 2.5  # mean square that is no doubt, however many epochs show it
+MIN_EXCESS = 2.5  # mean square that is no doubt, however many epochs show it
 P_EXCESS = float(erfc(DOUBT / np.sqrt(2.0)))  # of a mean square by chance
-LEAST_WORTH = 0.2  # epochs
+MIN_EQUIVALENT_EPOCHS = 0.2  # epochs
 OFTEN_REFUSED = 0.5  # of a beacon's epochs
-MANY_RESTARTS = 3.0
+MAX_RESTARTS = 3.0
 PRIOR_EVERY = 1.0  # s
-LARGEST_INFLATION = 1e8
-LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
+MAX_INFLATION = 1e8
+MIN_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 PROBATION = 2.0  # s; after a recovery or a failed update
 
 
@@ -193,7 +193,7 @@ class OnlineMonitor:
         return Judgement(
             findings=tuple(finding for part in parts for finding in part.findings),
             excluded=tuple(sorted(set(gate.refused))),
-            inflation=min(LARGEST_INFLATION, max(part.inflation for part in parts)),
+            inflation=min(MAX_INFLATION, max(part.inflation for part in parts)),
             turn=max(part.turn for part in parts),
             shift=max(part.shift for part in parts),
         )
@@ -235,9 +235,9 @@ class OnlineMonitor:
         result, inflation = [], 1.0
         for name, level in self._level.items():
             mean, worth = float(level.mean[0]), level.count / self._repeats
-            freedom = 6.0 * self.channels[name] * max(worth, LEAST_WORTH)
+            freedom = 6.0 * self.channels[name] * max(worth, MIN_EQUIVALENT_EPOCHS)
             limit = largest_mean_square(P_EXCESS, freedom, self._noise_freedom.get(name, np.inf))
-            limit = max(limit, LEAST_EXCESS)
+            limit = max(limit, MIN_EXCESS)
             if mean > limit:
                 inflation = max(inflation, self._repeats * mean)
                 text = (
@@ -275,7 +275,7 @@ class OnlineMonitor:
             self._shared_variance = np.concatenate(list(own))
         # Considered parameters shift estimate and error alike: their variance counts in both.
         both = 2.0 * np.minimum(self._shared_variance, remaining)
-        gained = np.maximum(prior - remaining + both, LEAST_GAIN * prior)
+        gained = np.maximum(prior - remaining + both, MIN_GAIN * prior)
         scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
         of_site, result, inflation = self._of_site, [], 1.0
         total = float((change**2 / usual)[of_site].sum())
@@ -331,13 +331,13 @@ class OnlineMonitor:
                 result.append(Finding(code, _PASSED[code], weight=0.5))
         restarts = self._restarts
         kept = np.exp(-max(0.0, time - restarts.time) / RESTARTS_MEMORY) * restarts.weight
-        if kept > MANY_RESTARTS - 1.0:
+        if kept > MAX_RESTARTS - 1.0:
             text = (
                 f"The platform was lost about {kept:.0f} times in the last minute: fields and"
                 " inertial data are inconsistent. Check axes, signs, units and stamps of the IMU."
             )
-            verdict = Verdict.FAILED if kept > 2.0 * MANY_RESTARTS else Verdict.DOUBTFUL
-            result.append(Finding("restarts", text, verdict, weight=kept / MANY_RESTARTS))
+            verdict = Verdict.FAILED if kept > 2.0 * MAX_RESTARTS else Verdict.DOUBTFUL
+            result.append(Finding("restarts", text, verdict, weight=kept / MAX_RESTARTS))
         return Judgement(tuple(result))
 
     def _of_fixes(self) -> Judgement:

@@ -15,13 +15,13 @@ from magfusion.estimation.graph import state
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.change_detection import (
     CHANGED,
-    MOST_BEACONS,
+    MAX_BEACONS,
     changed_name,
     step_of,
     step_time,
 )
 from magfusion.estimation.integrity.fault_candidates import FaultCandidate
-from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
+from magfusion.estimation.integrity.fixed_parameter_test import MIN_EVIDENCE
 from magfusion.estimation.integrity.released_fault import gains
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.model.parameters import BEACON_POSITION, BEACON_ROTATION, Block
@@ -31,7 +31,7 @@ from magfusion.units import Array
 
 ONSET_INTERVAL = 2.0  # s; a step between two is tested as at the next one
 BIASES = {ACCEL_BIAS: state.ACCEL_BIAS, GYRO_BIAS: state.GYRO_BIAS}  # their rows of the tangent
-MOST_ONSETS = 6  # times of tested steps; the older ones are farther apart
+MAX_ONSETS = 6  # times of tested steps; the older ones are farther apart
 
 
 class RecentSteps:
@@ -43,7 +43,7 @@ class RecentSteps:
     def __init__(self, site: Site, estimated: tuple[Block, ...]) -> None:
         kinds = (BEACON_POSITION, BEACON_ROTATION)
         poses = [b for b in estimated if b.parameter in kinds]
-        poses = poses if 1 < len(site.beacons) <= MOST_BEACONS else []
+        poses = poses if 1 < len(site.beacons) <= MAX_BEACONS else []
         biases = BIASES if site.platform.inertial else {}
         self._steps = (*((b.parameter, b.owner) for b in poses), *((b, "imu") for b in biases))
         columns = [slice(MOTION + b.columns.start, MOTION + b.columns.stop) for b in poses]
@@ -70,7 +70,7 @@ class RecentSteps:
             exact_response=np.concatenate([sums.exact_response, response], axis=1),
             onsets=(*sums.onsets, sums.time),
         )
-        return new if len(new.onsets) <= MOST_ONSETS else self._without_one(new)
+        return new if len(new.onsets) <= MAX_ONSETS else self._without_one(new)
 
     def _without_one(self, sums: Sums) -> Sums:
         age = sums.time - np.array(sums.onsets)
@@ -109,7 +109,7 @@ class RecentSteps:
             rows = np.concatenate([np.arange(b.columns.start, b.columns.stop) for b in moved])
             own = information[np.ix_(rows, rows)]
             gain = gains(np.eye(len(rows))[None], own, gradient[rows])
-            if gain[0] > LEAST_EVIDENCE + price:
+            if gain[0] > MIN_EVIDENCE + price:
                 combine = np.eye(len(gradient))[:, rows]
                 result.append(FaultCandidate(changed_name(moved), moved, combine, CHANGED))
         return result

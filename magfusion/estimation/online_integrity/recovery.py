@@ -19,10 +19,10 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, ComplexArray
 
-MOST_REFUSED = 2  # beacons
+MAX_REFUSED = 2  # beacons
 DOUBT = 1e-6  # probability of a worse agreement
 EXPLAINED = 0.25  # of the field; a larger residual is no explanation, whatever its covariance
-FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # s; between attempts at a fix, doubled each time
+FIRST_WAIT, MAX_WAIT = 0.1, 2.0  # s; between attempts at a fix, doubled each time
 BIAS_LIMIT = 6.0  # prior sigmas; a larger bias is the result of a wrong pose
 
 
@@ -39,7 +39,7 @@ class AgreedFix(NamedTuple):
 
 
 class Attempts:
-    """Times of attempts at a fix: at once, then after waits that double up to `LONGEST_WAIT`.
+    """Times of attempts at a fix: at once, then after waits that double up to `MAX_WAIT`.
 
     `lost_since`: when the platform was lost (s); None where it is not.
     """
@@ -63,7 +63,7 @@ class Attempts:
         self.lost_at(time)
         if time < self._next:
             return False
-        self._next, self._wait = time + self._wait, min(2.0 * self._wait, LONGEST_WAIT)
+        self._next, self._wait = time + self._wait, min(2.0 * self._wait, MAX_WAIT)
         return True
 
     def over(self) -> None:
@@ -156,7 +156,7 @@ def agreed_fix(
     least = 2 if prior is None else 1
     if whole is None or _agrees(whole, samples):
         return whole
-    for count in range(1, min(MOST_REFUSED, len(detected) - least) + 1):
+    for count in range(1, min(MAX_REFUSED, len(detected) - least) + 1):
         refused = [np.isin(owner, names) for names in combinations(detected, count)]
         tried = _fixed(samples, calibration, prior, refused)
         agreed = [fix for fix in tried if fix is not None and _agrees(fix, samples)]

@@ -19,7 +19,7 @@ from magfusion.estimation.integrity.corrected_site import with_bias_walk
 from magfusion.estimation.integrity.correction import Correction, Rival, corrections, open_rivals
 from magfusion.estimation.integrity.fault_candidates import FaultCandidate
 from magfusion.estimation.integrity.fixed_parameter_test import (
-    LEAST_EVIDENCE,
+    MIN_EVIDENCE,
     NamedCause,
     causes_of,
     finding_of,
@@ -52,7 +52,7 @@ from magfusion.units import Array
 
 MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 1.0, 20.0  # s; shortest and longest interval of results
 ENOUGH = 4  # epochs for the shortest interval
-MOST_WAITING = 10  # epochs; larger batches would delay an update
+MAX_WAITING = 10  # epochs; larger batches would delay an update
 
 
 class OnlineScore:
@@ -205,7 +205,7 @@ class OnlineScore:
         self._epochs_since_score += 1
         if self._steps.is_due(self._sums, predicted.time) and (sums := self.settle()) is not None:
             self._sums = self._steps.with_onset(sums)
-        if are_many(self.site) or len(self._waiting) >= MOST_WAITING:
+        if are_many(self.site) or len(self._waiting) >= MAX_WAITING:
             self.settle()
 
     def settle(self) -> Sums | None:
@@ -289,7 +289,7 @@ class OnlineScore:
         """Return the judgement by steel; None if it does not explain the data better."""
         best = np.max(self.targets.gains(*score.with_declared(tolerance=False)), initial=0.0)
         rival = max(float(best), sum(one.cause.gain for one in named))
-        estimate = None if rival < LEAST_EVIDENCE else steel_of_score(score, rival)
+        estimate = None if rival < MIN_EVIDENCE else steel_of_score(score, rival)
         if estimate is None:
             return None
         largest = [

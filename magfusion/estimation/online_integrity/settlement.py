@@ -38,15 +38,15 @@ from magfusion.units import DAY, DEGREE, HOUR, Array, BoolArray, ComplexArray, I
 
 SETTLEMENT = "settlement"  # code
 AVERAGED = 1800.0  # s; of one average
-LEAST_AVERAGES, MOST_AVERAGES = 8, 96  # two neighbours are joined where there are more
+MIN_AVERAGES, MAX_AVERAGES = 8, 96  # two neighbours are joined where there are more
 INTERVAL = 20.0  # s; between two poses at which the platform might have begun to rest
 NEAR, NEARLY = 0.02, 2.0 * DEGREE  # m, rad; estimates of one pose at rest differ by less
 POSE = 6  # components of a beacon's movement: rotation, then position
 UNOBSERVED = 1e-4  # share of the largest information, below which a direction is a gain or a phase
 TURN_GAIN = float(chdtri(3, 1e-3))  # what a turn explains by chance
-LARGEST_CORRELATION = 0.95  # of successive averages
+MAX_CORRELATION = 0.95  # of successive averages
 # By chance in one result of a rest, of which there are as many as averages.
-P_MOVED = FALSE_ALARMS / MOST_AVERAGES
+P_MOVED = FALSE_ALARMS / MAX_AVERAGES
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Rest:
             value = getattr(self, name)
             if value.shape != shape or not np.all(np.isfinite(value)):
                 raise ValueError(f"has an invalid {name}")
-        if self.count.ndim != 1 or not np.all(self.count > 0.0) or averages > MOST_AVERAGES:
+        if self.count.ndim != 1 or not np.all(self.count > 0.0) or averages > MAX_AVERAGES:
             raise ValueError("has invalid counts")
 
     def with_epoch(self, time: float, measured: Array, weight: float = 1.0) -> "Rest":
@@ -103,7 +103,7 @@ class Rest:
         count, times, mean = self.count, self.time, self.mean
         number = (time - self.begin) // AVERAGED
         if not len(count) or number > (self.used - self.begin) // AVERAGED:
-            if len(count) >= MOST_AVERAGES:
+            if len(count) >= MAX_AVERAGES:
                 count, times, mean = _joined(count, times, mean)
             count, times = np.append(count, 0.0), np.append(times, 0.0)
             mean = np.concatenate([mean, np.zeros((1, mean.shape[1]))])
@@ -199,7 +199,7 @@ class SettlementTest:
             return
         weight = rest.variance / _mean_variance(samples)
         self._rest = rest.with_epoch(state.time, phasors.measured[0], weight)
-        if len(self._rest.count) != len(rest.count) >= LEAST_AVERAGES:  # an average is complete
+        if len(self._rest.count) != len(rest.count) >= MIN_AVERAGES:  # an average is complete
             moved = movements(rest, len(self.site.beacons))
             self._movements = tuple(one.finding(self.site) for one in moved)
 
@@ -340,7 +340,7 @@ def _after_a_step(count: Array, mean: Array) -> float:
 def _correlated(scatter: Array) -> float:
     """Return the factor of a slope's variance by the correlation of successive averages."""
     both = np.sum(scatter[1:] * scatter[:-1])
-    share = float(np.clip(both / np.sum(scatter**2), 0.0, LARGEST_CORRELATION))
+    share = float(np.clip(both / np.sum(scatter**2), 0.0, MAX_CORRELATION))
     return (1.0 + share) / (1.0 - share)
 
 

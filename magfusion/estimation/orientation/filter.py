@@ -56,10 +56,10 @@ NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not indep
 SYNCHRONY = 0.003  # s; synchronisation error of field and rate samples
 SPEED_TIME = 1.0  # s; correlation time of the speed
 LEAKAGE = 1.0  # s; decay time of the speed for the estimate of its size
-LEAST_SPEED = 0.3  # m/s
+MIN_SPEED = 0.3  # m/s
 REST_RATE = np.deg2rad(0.03)  # rad/s, of one second
 GATE = 25.0  # chi square of three components
-LEAST_CHANGE, VARIANCE_INCREASE = 3.0, 4.0  # uT; factor of the variance after a change
+MIN_CHANGE, VARIANCE_INCREASE = 3.0, 4.0  # uT; factor of the variance after a change
 TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
@@ -118,7 +118,7 @@ class OrientationFilter:
         self._least = (AMBIENT * float(np.linalg.norm(self.earth))) ** 2
         self._deviation = self._least
         self._noise: float | None = None
-        self._speed, self._leaky = LEAST_SPEED**2, np.zeros(3)
+        self._speed, self._leaky = MIN_SPEED**2, np.zeros(3)
         self._before: Array | None = None
         self._begun: float | None = None
 
@@ -257,7 +257,7 @@ class OrientationFilter:
             variance = self.site.platform.motion.rest_speed_sigma**2
             return Row(by_state, -state.velocity_world, np.full(3, variance))
         length = max(float(np.sum(stretch.steps)), 1e-3)
-        variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
+        variance = max(self._speed, MIN_SPEED**2) * max(1.0, SPEED_TIME / length)
         by_arm = state.world_from_body @ skew(turn.rate[-1])
         by_state[:, ARM] = -by_arm
         error = by_arm @ state.arm - state.velocity_world
@@ -307,7 +307,7 @@ class OrientationFilter:
         row = Row(by_state, error, np.full(3, variance))
         if separate <= GATE:
             return row, False, state
-        change = max(float(error @ error), LEAST_CHANGE**2)
+        change = max(float(error @ error), MIN_CHANGE**2)
         self._deviation = max(self._deviation, change)
         cov = state.cov.copy()
         cov[OFFSET, OFFSET] += VARIANCE_INCREASE * change * np.eye(3)

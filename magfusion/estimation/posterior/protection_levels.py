@@ -20,8 +20,8 @@ from magfusion.estimation.posterior.separation import (
 from magfusion.model.trust import Risk
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
-PRECISE, MOST_STEPS = 1e-7, 60  # of a level
-MOST_DEG = 180.0  # an attitude level beyond it is not informative
+PRECISE, MAX_STEPS = 1e-7, 60  # of a level
+MAX_DEG = 180.0  # an attitude level beyond it is not informative
 PAIRS_MATTER = 0.5  # share of the risk, above which two faulty beacons are monitored
 AT_ONCE = 256  # states whose pairs are computed together
 
@@ -126,7 +126,7 @@ def protection_levels(
     )
     level = np.where(covered[:, None], level, np.nan)
     degrees = level[:, 0] / DEGREE
-    return level[:, 1], np.where(degrees <= MOST_DEG, degrees, np.nan)
+    return level[:, 1], np.where(degrees <= MAX_DEG, degrees, np.nan)
 
 
 def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk: Array) -> Array:
@@ -166,7 +166,7 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
     at_low, at_high, width = falling(low), np.minimum(falling(high), 0.0), PRECISE * high
     rose = np.full(high.shape, 2)
     with np.errstate(invalid="ignore"):  # for infinite ends
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             wide = high - low > width
             if not wide.any():
                 break

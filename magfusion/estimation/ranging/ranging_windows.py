@@ -14,7 +14,7 @@ from magfusion.units import Array
 
 SENSOR = "magnetometer"  # as a part of the table of depths
 UPRIGHT = 0.05  # of gravity across the hole; below, it has no high side
-LEAST_WINDOWS = 8
+MIN_WINDOWS = 8
 PAUSE = 2.0  # s; without samples, after which angle tracking restarts
 
 
@@ -73,10 +73,10 @@ def ranging_log(
         fields.time + 0.5 * window <= known[0, -1] + 1.0
     )
     fields, speed = fields.rows(inside), result.speed_hz[inside]
-    if len(fields) < LEAST_WINDOWS:
+    if len(fields) < MIN_WINDOWS:
         raise InputError(
             f"only {len(fields)} windows of {window:g} s have samples, depths and a rotating"
-            f" magnet, but ranging needs {LEAST_WINDOWS}; record a longer pass, or use a shorter"
+            f" magnet, but ranging needs {MIN_WINDOWS}; record a longer pass, or use a shorter"
             " --window"
         )
     at = fields.time[:, None] + window * WITHIN

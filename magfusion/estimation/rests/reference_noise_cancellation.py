@@ -25,8 +25,8 @@ from magfusion.receiver.reference import (
 from magfusion.receiver.reference_clock import ReferenceClock, lag_in
 from magfusion.units import Array, BoolArray
 
-LEAST_COVERED = 0.8  # share of a rest's pieces that the reference must cover
-MOST_HIDDEN = 0.5  # sigmas of a phasor
+MIN_COVERED_SHARE = 0.8  # share of a rest's pieces that the reference must cover
+MAX_HIDDEN_SIGMA = 0.5  # sigmas of a phasor
 CONTRADICTED = 2.0  # detected over predicted field of a beacon at the reference
 P_FALSE_ALARM = 1e-6  # false-alarm probability below which a detection contradicts the site
 HIGHEST = 0.45  # of the sampling rate; maximum frequency of the probes
@@ -90,7 +90,11 @@ def align_reference(
         clock = known.clock if seen is None else known.clock.updated(*seen)
         lag = clock.line or NO_LAG
     measured, there = reference_at(wave, own, lag)
-    return AlignedReference(measured, there, lag, clock) if np.mean(there) > LEAST_COVERED else None
+    return (
+        AlignedReference(measured, there, lag, clock)
+        if np.mean(there) > MIN_COVERED_SHARE
+        else None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +151,7 @@ def clean_pieces(
     last = np.searchsorted(wave.time, result.centre + 0.5 * length)
     missing = np.concatenate([[0], np.cumsum(~reference.there)])
     there = missing[last] == missing[first]
-    if np.mean(there) < LEAST_COVERED:
+    if np.mean(there) < MIN_COVERED_SHARE:
         return CleanedPieces(raw, None, None, none)
     middle = 0.5 * (span[0] + span[1])
     before = (known or ReferenceHistory()).at(reference.lag, middle, tones_hz)
@@ -253,7 +257,7 @@ def reference_findings(rests: list[list[JudgedTone]], site: Site) -> tuple[Findi
         )
         out.append(Finding("reference_unused", text, Verdict.TRUSTWORTHY))
     hidden = max(one.hidden for rest in rests for one in rest)
-    if hidden > MOST_HIDDEN:
+    if hidden > MAX_HIDDEN_SIGMA:
         text = (
             "The site does not declare the position of the reference sensor: it is assumed out of"
             " reach of the beacons. What it may receive of them unnoticed would change phasors by"

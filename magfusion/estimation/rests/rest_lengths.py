@@ -3,26 +3,26 @@
 import numpy as np
 
 from magfusion.model.site import Site
-from magfusion.receiver.integration import LEAST_LENGTHS
+from magfusion.receiver.integration import MIN_LENGTHS
 from magfusion.receiver.windows import LockinSettings, sent_frequencies_hz
 from magfusion.units import HOUR
 
-LONGEST_PIECE = 8.0  # s
+MAX_PIECE = 8.0  # s
 PIECE_TURNS = 8.0  # of the closest tones against each other, in a piece
 UNKNOWN_TURN = 0.2  # of a tone, that an unknown clock may make in a piece that is searched
-LARGEST_WALK = 0.1  # rad; of a phase against its mean, in a rest that is one epoch
+MAX_WALK = 0.1  # rad; of a phase against its mean, in a rest that is one epoch
 
 
 def piece_length(
     site: Site, usual: LockinSettings, lockin: LockinSettings | None, duration: float
 ) -> float | None:
     """Return the length of pieces for a rest (s); None where it is too short for any."""
-    maximum = duration / LEAST_LENGTHS
+    maximum = duration / MIN_LENGTHS
     if lockin is not None and lockin.window != usual.window:
         return lockin.window if lockin.window <= maximum else None
     lines = np.sort(np.append(sent_frequencies_hz(site), 0.0))
     spacing = float(np.min(np.diff(lines)))
-    wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
+    wanted = min(max(PIECE_TURNS / spacing, usual.window), MAX_PIECE)
     for beacon in site.beacons:
         if not beacon.synchronised:
             highest = float(np.max(beacon.tone_frequencies_hz))
@@ -34,7 +34,7 @@ def piece_length(
 def coherent(site: Site) -> float:
     """Return the longest rest that may be one epoch (s), by the stability of phases and clocks."""
     duration = 1000.0 * HOUR
-    while walk(site, float(np.max(sent_frequencies_hz(site))), duration) > LARGEST_WALK**2:
+    while walk(site, float(np.max(sent_frequencies_hz(site))), duration) > MAX_WALK**2:
         duration *= 0.9
     return duration
 

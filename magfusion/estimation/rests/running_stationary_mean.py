@@ -16,7 +16,7 @@ from magfusion.receiver.integration import trace_chance
 from magfusion.receiver.windows import sent_frequencies_hz
 from magfusion.units import Array, ComplexArray
 
-LEAST_FREEDOM = 8.0  # of a covariance that is estimated from few readings
+MIN_FREEDOM = 8.0  # of a covariance that is estimated from few readings
 LOOKS = 6.0 / np.pi**2  # share of the first look in the false alarms; then a fourth, a ninth
 
 
@@ -133,7 +133,7 @@ class RunningMean:
                 continue
             phasor = np.linalg.solve(self.information[c], self.weighted[c])
             cov = self._widened(c, np.linalg.inv(self.information[c]))
-            freedom = max(float(self.freedom[c]), LEAST_FREEDOM)
+            freedom = max(float(self.freedom[c]), MIN_FREEDOM)
             trace = float(np.real(np.conj(phasor) @ np.linalg.solve(cov, phasor)))
             alone = trace_chance(trace * freedom / (freedom - 4.0), int(freedom))
             out[c] = min(1.0, alone * max(self.looks, 1) ** 2 / LOOKS)

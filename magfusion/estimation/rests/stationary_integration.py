@@ -26,7 +26,7 @@ from magfusion.model.strapdown import resting
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.hum import hum_of
 from magfusion.receiver.integration import (
-    LEAST_LENGTHS,
+    MIN_LENGTHS,
     FrequencySearch,
     Integrated,
     chance_of_any,
@@ -38,7 +38,7 @@ from magfusion.receiver.windows import LockinSettings, default_settings, sent_fr
 from magfusion.units import Array, BoolArray
 
 TOO_SHORT = "rest too short"
-LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
+MIN_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def integrate_rests(
     spans, dropped = _epochs_at_rest(log, site, usual, lockin, least)
     parts = [rest_epoch(log, span, site, length, mains_hz, false_alarm) for span, length in spans]
     if not parts:
-        need = LEAST_LENGTHS * usual.window
+        need = MIN_LENGTHS * usual.window
         short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
         raise InputError(
             f"--at-rest: the log has no rest of {need:.3g} s{short}; keep the platform still for"
@@ -180,7 +180,7 @@ def rests(log: Log, site: Site) -> list[tuple[float, float]]:
     still = resting(stamps, gyro, log.imu.accel_body, motion=motion)
     still[1:] &= np.diff(stamps) < motion.rest_span
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
-    slow = max(LEAST_RATE, 5.0 * site.platform.imu.gyro_bias_sigma)
+    slow = max(MIN_RATE, 5.0 * site.platform.imu.gyro_bias_sigma)
     result = []
     for begin, end in edges.reshape(-1, 2):
         # An even turn has a quiet gyroscope, too.

@@ -29,7 +29,7 @@ from magfusion.units import TINY, Array, BoolArray, ComplexArray, IntArray
 
 KEPT = 24  # positions of the grid that are refined roughly
 SHAPE = 0.2  # error of the axes fitted there, relative to their length
-LEAST_TURN = 1e-6  # weight of the world's axes, to select the smallest of the open rotations
+MIN_ROTATION = 1e-6  # weight of the world's axes, to select the smallest of the open rotations
 
 
 def starts_on_grid(problem: FixProblem) -> tuple[FixState, int]:
@@ -212,7 +212,7 @@ class _AxisGrid:
         gravity = self.problem.gravity
         if gravity is not None and np.isfinite(gravity.sigma[row]):
             along[:, 2] += gravity.up_body[row]
-        return wahba(along + LEAST_TURN * np.eye(3))
+        return wahba(along + MIN_ROTATION * np.eye(3))
 
 
 def _misshapen(axes: Array, body: Array) -> Array:

@@ -34,7 +34,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 DUPLICATE_DISTANCE = 1e-3  # of the distance; hypotheses closer to one another are one
 RIVAL = 25.0  # chi square above the best, from which a hypothesis is dropped
-LEAST_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
+MIN_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
 UNKNOWNS = 6  # of position, direction and gain
 CHUNK = 200  # epochs refined at once
 REFINED, MIRRORED = 12, 3  # rough starts that are refined, and results whose mirrors are tried
@@ -54,7 +54,7 @@ class Gain(NamedTuple):
         row = "xyz".index(sensor.axes)
         nominal = float(np.linalg.norm(sensor.matrix[row]))
         sigma = float(sensor.sigma.matrix[row, row]) / nominal
-        return Gain(nominal, np.inf if free_parameters else max(sigma, LEAST_GAIN_SIGMA))
+        return Gain(nominal, np.inf if free_parameters else max(sigma, MIN_GAIN_SIGMA))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from magfusion.model.site import Site
 
 MAX_EPOCHS = 60  # epochs, spread over a log
 MIN_COUNT = 5  # of them, that determine a gain
-LEAST_SIGMA = 0.01  # of the logarithm; model errors are common to all epochs
+MIN_SIGMA = 0.01  # of the logarithm; model errors are common to all epochs
 
 
 def with_found_gain(fields: FieldSamples, site: Site) -> Site:
@@ -48,6 +48,6 @@ def with_found_gain(fields: FieldSamples, site: Site) -> Site:
     matrix, sigma = sensor.matrix.copy(), sensor.sigma.matrix.copy()
     matrix[row] *= factor
     sigma[row] *= factor
-    sigma[row, row] = max(scatter, LEAST_SIGMA) * np.exp(middle)
+    sigma[row, row] = max(scatter, MIN_SIGMA) * np.exp(middle)
     known = replace(sensor, matrix=matrix, sigma=replace(sensor.sigma, matrix=sigma))
     return replace(site, platform=replace(site.platform, magnetometer=known))

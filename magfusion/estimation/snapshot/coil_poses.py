@@ -18,7 +18,7 @@ from magfusion.model.truth_poses import truth_poses
 from magfusion.units import Array, BoolArray
 
 AMBIGUOUS = 0.05  # posterior share from which an alternative is reported
-FEW = 0.1  # share of the epochs; a larger one casts doubt
+MAX_OPEN_SHARE = 0.1  # share of the epochs; a larger one casts doubt
 
 
 def poses_of(result: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
@@ -190,5 +190,5 @@ def _share(code: str, rows: BoolArray, what: str) -> list[Finding]:
     count, share = int(np.sum(rows)), float(np.mean(rows))
     if not count:
         return []
-    verdict = Verdict.DOUBTFUL if share > FEW else Verdict.TRUSTWORTHY
-    return [Finding(code, f"{count} of {len(rows)} epochs {what}", verdict, share / FEW)]
+    verdict = Verdict.DOUBTFUL if share > MAX_OPEN_SHARE else Verdict.TRUSTWORTHY
+    return [Finding(code, f"{count} of {len(rows)} epochs {what}", verdict, share / MAX_OPEN_SHARE)]

@@ -14,7 +14,7 @@ from magfusion.model.trust import Finding, StateTrust, Trust, Verdict, worst
 from magfusion.units import Array, BoolArray, IntArray
 
 RIVAL = 0.05  # posterior probability from which a second pose counts
-FEW = 0.05  # share of epochs that may be open before the whole is in doubt
+MAX_OPEN_SHARE = 0.05  # share of epochs that may be open before the whole is in doubt
 
 
 def judged_fixes(
@@ -100,6 +100,6 @@ def _of_epochs(rival: BoolArray, open_pose: BoolArray, odd: BoolArray) -> Iterat
     ):
         count, epochs = int(np.sum(rows)), len(rows)
         if count:
-            verdict = Verdict.DOUBTFUL if count > FEW * epochs else Verdict.TRUSTWORTHY
-            share = count / epochs / FEW
+            verdict = Verdict.DOUBTFUL if count > MAX_OPEN_SHARE * epochs else Verdict.TRUSTWORTHY
+            share = count / epochs / MAX_OPEN_SHARE
             yield Finding(code, f"{count} of {epochs} epochs {what}", verdict, share)

@@ -16,7 +16,7 @@ from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray
 
 MIN_EPOCHS = 3  # epochs needed for neighbours on both sides
-LONGEST = 1.0  # s; more distant fixes are not used
+MAX_INTERVAL = 1.0  # s; more distant fixes are not used
 
 
 def fixed_in_motion(epochs: FixEpochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
@@ -66,7 +66,7 @@ def velocities(fixes: Fixes, site: Site, *, rotated: bool) -> tuple[Array, Array
     here, unsure = np.arange(len(fixes)), np.full(variance.shape, np.inf)
     sides = []
     for others in (np.maximum(here - 1, 0), np.minimum(here + 1, len(here) - 1)):
-        known = (others != here) & (np.abs(fixes.time[others] - fixes.time) < LONGEST)
+        known = (others != here) & (np.abs(fixes.time[others] - fixes.time) < MAX_INTERVAL)
         result, own = _nearest(place, variance, there, others)
         use = known[:, None] & np.isfinite(own)
         sides.append(

@@ -9,14 +9,14 @@ from magfusion.units import Array, BoolArray
 
 DECREASE = 1e-6  # of the cost; a step that decreases it by less is the last
 DECREASE_CURVED = 1e-9  # relative; a Newton step that decreases a cost by less is the last
-MOST_STEPS = 100
-LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature is not valid
+MAX_BOUNDED_STEPS = 100
+MAX_CURVED_STEP = 2.0  # of the steps of `minimise_curved`: beyond, a curvature is not valid
 SUFFICIENT = 1e-4  # share of the decrease that the slope predicts
 FLATTEST = 1e-10  # of the largest curvature
 LINEAR = 0.05  # share of a slope by which a curvature may differ from that of a pure variance
 MAX_STEPS = 200
 MIN_STEP = 1e-2  # of a logarithm; a smaller step is near the minimum
-SHORTEST = 1e-9  # of a step; if that does not decrease the cost, the rest is rounding
+MIN_RELATIVE_STEP = 1e-9  # of a step; if that does not decrease the cost, the rest is rounding
 DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems is far below it
 
 
@@ -60,7 +60,7 @@ def minimise_curved(
     low, high = limits.T
     at = np.minimum(np.maximum(start, low), high)
     here, going = cost(at), np.ones(len(at), dtype=bool)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_BOUNDED_STEPS):
         slope, curvature = curved(at)
         free_parameters = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
         going &= free_parameters.any(axis=1)
@@ -73,7 +73,9 @@ def minimise_curved(
             )
             * free_parameters
         )
-        step *= LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), LONGEST)
+        step *= MAX_CURVED_STEP / np.maximum(
+            np.abs(step).max(axis=1, keepdims=True), MAX_CURVED_STEP
+        )
         predicted = -0.5 * (slope * step).sum(axis=1)
         last = predicted < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
         # In the logarithm of a vanishing variance every step is a half, again and again.
@@ -104,7 +106,7 @@ def _line_search_step(
     """Return searches after the longest decreasing part of a step, the cost, and which moved."""
     remaining, elapsed = going.copy(), np.zeros(len(at), dtype=bool)
     while True:
-        remaining &= (np.abs(step) > SHORTEST).any(axis=1)
+        remaining &= (np.abs(step) > MIN_RELATIVE_STEP).any(axis=1)
         if not remaining.any():
             return at, here, elapsed
         tried = np.minimum(np.maximum(at + step, low), high)

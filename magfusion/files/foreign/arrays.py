@@ -17,8 +17,8 @@ from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import Raw
 from magfusion.units import AnyArray
 
-MOST_COLUMNS = 64  # of an array that is a table
-AXES_AND_TIME, LEAST_STAMPS = 4, 8  # columns of a sensor with its stamps; rows that show it
+MAX_COLUMNS = 64  # of an array that is a table
+AXES_AND_TIME, MIN_STAMPS = 4, 8  # columns of a sensor with its stamps; rows that show it
 HDF5_MARK = b"\x89HDF"
 ARRAYS = (".npy", ".npz", ".wav", ".mat", ".h5", ".hdf5", ".hdf", ".parquet")
 
@@ -82,13 +82,13 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
     down = _rows_axis(shape, by_column)
     across = [k for k in range(len(shape)) if k != down]
     places = [()] if len(shape) == 1 else list(np.ndindex(*(shape[k] for k in across)))
-    if len(places) * len(parts) > MOST_COLUMNS:
+    if len(places) * len(parts) > MAX_COLUMNS:
         return []
     block = partial(_block, down)
     names = [_column_name(name, place[::-1] if by_column else place) for place in places]
     if len(places) == AXES_AND_TIME and len(shape) == 2:
         first = block(array, 0, ROWS)[:, 0]
-        if len(first) > LEAST_STAMPS and np.all(np.diff(first) >= 0.0) and first[-1] > first[0]:
+        if len(first) > MIN_STAMPS and np.all(np.diff(first) >= 0.0) and first[-1] > first[0]:
             names = [f"{name}:{one}" for one in ("time", "x", "y", "z")]
     if len(places) == 1:
         names = [name or "0"]
@@ -104,7 +104,7 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
 def _rows_axis(shape: Sequence[int], by_column: bool) -> int:
     """Return along which axis of an array its rows are."""
     if len(shape) == 2 and 1 not in shape:
-        return int(shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS)
+        return int(shape[0] < shape[1] if not by_column else shape[0] <= MAX_COLUMNS)
     return int(np.argmax(shape))
 
 

@@ -15,26 +15,32 @@ from magfusion.files.foreign.columns import EULER, OPTIONAL_COLUMNS, QUATERNION,
 from magfusion.files.foreign.plan import ImportPlan
 from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
-from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows, coarse_text, copied_rows
-from magfusion.files.plausible import SHORTEST_STEP
-from magfusion.files.pose_rows import FEW_OFF, MOST_OFF, PoseRows
+from magfusion.files.lost_rows import (
+    MAX_DUPLICATED,
+    MAX_MISSING,
+    LostRows,
+    coarse_text,
+    copied_rows,
+)
+from magfusion.files.plausible import MIN_STEP
+from magfusion.files.pose_rows import MAX_LENGTH_ERROR, MAX_UNNORMALIZED_SHARE, PoseRows
 from magfusion.files.row_stamps import batches_text, separate_stamps
 from magfusion.files.stray_stamps import (
     EDGE_S,
-    LONGEST_GAP,
-    MOST_STRAY,
-    MOST_STRAY_ROWS,
+    MAX_GAP,
+    MAX_STRAY_ROWS,
+    MAX_STRAY_SHARE,
     counted_back,
     misplaced_rows,
     stray_rows,
 )
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
+from magfusion.files.table import MAX_NUMBER, MAX_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.model.counters import lost_by_wrapping
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
 STEPS = {  # s
-    **dict.fromkeys(("imu", "gyro", "accel"), (SHORTEST_STEP, 0.5)),
+    **dict.fromkeys(("imu", "gyro", "accel"), (MIN_STEP, 0.5)),
     "magnetometer": (1e-6, 0.5),
 }
 OTHER_CLOCK = 0.3  # of a truth's rows, that may be stamped by another clock
@@ -66,12 +72,12 @@ class Counts:
     left_out_first: int = 0  # stray rows before the first
     before_ns: int = 0  # from the first sample, whose stamp may be stray, to the first one written
     # first, last: stamps (ns)
-    first: int = LARGEST_TIME_NS
-    last: int = -LARGEST_TIME_NS
+    first: int = MAX_TIME_NS
+    last: int = -MAX_TIME_NS
     previous: int = 0  # stamp of the last row that was written (ns)
     # newest, wrapped: stamp of the last row that was read, and what its counter lost by wrapping
     # until then (ns)
-    newest: int = -LARGEST_TIME_NS
+    newest: int = -MAX_TIME_NS
     wrapped: int = 0
 
     def leave_out(self, reason: str, count: int) -> None:
@@ -177,7 +183,7 @@ def _values(plan: ImportPlan, raw: dict[int, Raw], names: Sequence[str]) -> Arra
         rotated[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
         result |= dict(zip(QUATERNION, rotated.T, strict=True))
     values = np.stack([result[name] for name in names], axis=1)
-    values[~(np.abs(values) < LARGEST_NUMBER)] = np.nan
+    values[~(np.abs(values) < MAX_NUMBER)] = np.nan
     return values
 
 
@@ -212,7 +218,7 @@ def _kept(
     _refuse_jumps(plan, stamps, rows, counts)
     before = counts.previous if counts.written else int(stamps[0]) - 1
     twice: BoolArray = np.diff(stamps, prepend=before) == 0
-    counts.batched |= not counts.written and bool(np.mean(twice) > MOST_TWICE)
+    counts.batched |= not counts.written and bool(np.mean(twice) > MAX_DUPLICATED)
     if not counts.batched:
         copies = copied_rows(stamps, values)
         counts.leave_out(COPIES, int(np.sum(copies)))
@@ -256,7 +262,7 @@ def _unwrapped(stamps: IntArray, rows: BoolArray, counts: Counts) -> IntArray:
         return stamps
     seconds: Array = np.asarray(stamps[rows] * NANOSECOND)
     last = (counts.newest - counts.wrapped) * NANOSECOND
-    before = -np.inf if counts.newest == -LARGEST_TIME_NS else last
+    before = -np.inf if counts.newest == -MAX_TIME_NS else last
     missing = lost_by_wrapping(seconds, before, counts.wrapped * NANOSECOND) / NANOSECOND
     result = stamps.copy()
     result[rows] += np.rint(missing).astype(np.int64)
@@ -278,17 +284,17 @@ def _strays(stream: str, stamps: IntArray, counts: Counts) -> BoolArray:
 
 def _accepted(stream: str, count: int) -> tuple[float, int]:
     """Return share and number of rows that may be stray."""
-    return (OTHER_CLOCK, count) if stream == "truth" else (MOST_STRAY, MOST_STRAY_ROWS)
+    return (OTHER_CLOCK, count) if stream == "truth" else (MAX_STRAY_SHARE, MAX_STRAY_ROWS)
 
 
 def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
     before = counts.last if counts.written else int(stamps[0])
     steps = np.diff(stamps.astype(np.float64), prepend=float(before)) * NANOSECOND
-    far = np.abs(stamps) > LARGEST_TIME_NS
+    far = np.abs(stamps) > MAX_TIME_NS
     for bad, what in (
         (far, "is beyond any clock: another unit of time is probably meant"),
         (
-            steps > LONGEST_GAP,
+            steps > MAX_GAP,
             "is {size:.6g} s after the row above: the clock jumped; correct the times, or import"
             " the parts one by one",
         ),
@@ -365,13 +371,14 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
             )
         raise InputError(f"{place}: {result} for {stream}; {remedy}.")
     off = counts.left_out.get("with a quaternion not of unit length", 0)
-    if off > FEW_OFF * (counts.written + off):
+    if off > MAX_UNNORMALIZED_SHARE * (counts.written + off):
         raise InputError(
-            f"{place}: {off} of {counts.read} quaternions are more than {100.0 * MOST_OFF:.0f} %"
-            " off unit length: map other columns, or scale them if they are rotations."
+            f"{place}: {off} of {counts.read} quaternions are more than"
+            f" {100.0 * MAX_LENGTH_ERROR:.0f} % off unit length: map other columns, or scale them if they"
+            " are rotations."
         )
     twice = counts.left_out.get("with the stamp of another", 0)
-    if twice > MOST_TWICE * (counts.written + twice):
+    if twice > MAX_DUPLICATED * (counts.written + twice):
         raise InputError(coarse_text(place, stream, twice, counts.read))
     step = (counts.last - counts.first) * NANOSECOND / max(1, counts.written - 1)
     least, maximum = STEPS.get(stream, (0.0, np.inf))
@@ -382,7 +389,7 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
             f" such a sensor: {stream}.time is probably in another unit; write it by --map"
             f" '{stream}.time=NAME[unit]'."
         )
-    if counts.missing > MOST_MISSING * counts.written:
+    if counts.missing > MAX_MISSING * counts.written:
         raise InputError(
             f"{place}: {counts.missing} of {counts.written} rows lack a number of {stream}: map"
             " other columns, or leave out rows that are of another sensor."

@@ -18,7 +18,7 @@ SPACES = " "  # runs of them
 DELIMITERS = (",", ";", "\t", "|", SPACES)
 WORDS = {"comma": ",", "semicolon": ";", "tab": "\t", "pipe": "|", "space": SPACES}
 COMMENTS = ("#", "%", "//", "!")
-LEAST_SCORE = 0.5
+MIN_SCORE = 0.5
 _NUMBER = {
     sign: re.compile(
         rf"[-+]?(\d+{re.escape(sign)}?\d*|{re.escape(sign)}\d+)([eE][-+]?\d+)?|[-+]?inf"
@@ -140,10 +140,10 @@ def _way_of_writing(
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         for decimal in ".," if width else "":
             score = _share_of_numbers(rows, width, decimal, missing)
-            score *= 1.0 if width > 1 else LEAST_SCORE  # of one column only where no other reads
+            score *= 1.0 if width > 1 else MIN_SCORE  # of one column only where no other reads
             if score > best:
                 best, result = score, (sign, decimal, width)
-    if result is None or best < LEAST_SCORE:
+    if result is None or best < MIN_SCORE:
         shown = next((line for line in lines if line), "")[:60]
         raise InputError(
             f"{path}: holds no table of numbers (first line: {shown!r}); write a row of names and"

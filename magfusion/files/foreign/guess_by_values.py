@@ -31,8 +31,8 @@ _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
 NORMALISED = 0.15  # about one, of a field divided by its size: no gauss, the Earth has .7
-LEAST_RISING = 0.99  # of the steps of a clock
-LEAST_COUNTED = 0.9  # of the steps of an index
+MIN_RISING_SHARE = 0.99  # of the steps of a clock
+MIN_COUNTED_SHARE = 0.9  # of the steps of an index
 _RATES_HZ = (5.0, 30_000.0)
 _DATES_S = (9.5e8, 4.1e9)  # s since 1970: from 2000 to 2100
 
@@ -156,12 +156,12 @@ def _unit_in(column: SourceColumn, dimension: Dimension) -> SourceUnit | None:
 
 def _is_clock(values: Array) -> bool:
     steps = np.diff(values)
-    return bool(np.mean(steps > 0.0) > LEAST_RISING and np.all(np.isfinite(values)))
+    return bool(np.mean(steps > 0.0) > MIN_RISING_SHARE and np.all(np.isfinite(values)))
 
 
 def _is_index(values: Array) -> bool:
     """Return whether values count rows: integers that rise by one, but where rows are lost."""
-    return len(values) > 1 and float(np.mean(np.diff(values) == 1.0)) > LEAST_COUNTED
+    return len(values) > 1 and float(np.mean(np.diff(values) == 1.0)) > MIN_COUNTED_SHARE
 
 
 def _sizes(columns: Sequence[Array]) -> Array:

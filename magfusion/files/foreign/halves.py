@@ -17,7 +17,7 @@ from magfusion.units import NANOSECOND, Array, IntArray
 HALVES = ("gyro", "accel")
 UNCOVERED = "outside of the other half's table"
 MIN_RATE_RATIO = 0.9  # of a rate; where both are alike, the gyro's samples are kept
-MOST_STEPS = 3.5  # of the slower half, between which it is interpolated; farther is missing
+MAX_STEPS = 3.5  # of the slower half, between which it is interpolated; farther is missing
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     names = [f"{half}_{axis}" for half in HALVES for axis in "xyz"]
     schema = pa.schema([(TIME, pa.int64()), *((name, pa.float64()) for name in names)])
     built = Counts(read=counts[fast].read)
-    reach = round(MOST_STEPS * 1e9 / _rate(counts[slow]))  # ns
+    reach = round(MAX_STEPS * 1e9 / _rate(counts[slow]))  # ns
     exact = True
     options = {"compression": "zstd", "write_page_checksum": True}
     with pa.parquet.ParquetWriter(directory / "imu.parquet", schema, **options) as writer:

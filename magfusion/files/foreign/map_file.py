@@ -14,7 +14,7 @@ from magfusion.files.foreign.plan import Findings, Rate
 from magfusion.files.foreign.units import Dimension, parse_unit
 from magfusion.files.yaml_files import StrictModel, read_yaml
 
-MOST_SHIFT = 10**10  # s
+MAX_SHIFT = 10**10  # s
 
 
 class MapFile(StrictModel):
@@ -156,7 +156,7 @@ def _shifts(lines: Sequence[str], declared: Findings) -> dict[str, int]:
             seconds = Fraction(value)
         except (ValueError, ZeroDivisionError):
             seconds = None
-        if stream not in TABLES or seconds is None or abs(seconds) > MOST_SHIFT:
+        if stream not in TABLES or seconds is None or abs(seconds) > MAX_SHIFT:
             declared.problems.append(
                 f"--offset {line!r}: write TABLE=SECONDS with a table of {', '.join(TABLES)};"
                 " the seconds are added to its times."

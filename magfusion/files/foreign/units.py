@@ -21,7 +21,7 @@ from magfusion.units import (
 )
 
 ISO = "iso"
-MOST_EXACT = 1e14  # ns; a day, up to which a double resolves a hundredth of a nanosecond
+MAX_EXACT_NS = 1e14  # ns; a day, up to which a double resolves a hundredth of a nanosecond
 NO_STAMP = np.iinfo(np.int64).min
 Raw = Any  # an array of NumPy, or of Arrow
 
@@ -244,7 +244,7 @@ def _decimals(raw: pa.Array, scale: Fraction) -> IntArray:
         raise ValueError(bad[0].as_py() if len(bad) else "what is no number") from None
     numbers = values.to_numpy(zero_copy_only=False)
     present: BoolArray = np.isfinite(numbers)
-    if float(np.max(np.abs(numbers[present]), initial=0.0)) * float(scale) < MOST_EXACT:
+    if float(np.max(np.abs(numbers[present]), initial=0.0)) * float(scale) < MAX_EXACT_NS:
         return _scaled_floats(numbers, scale)
     parts = pc.extract_regex(text, r"^(?P<whole>[-+]?\d+)(?P<rest>\.\d*)?$")
     if parts.null_count > text.null_count:  # in exponents, or as .5

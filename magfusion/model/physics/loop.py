@@ -22,7 +22,7 @@ import numpy as np
 
 from magfusion.units import MU0_OVER_4PI, TINY, Array
 
-_MOST_MEANS = 10  # iterations, each of which doubles the digits; needed at the wire
+_MAX_MEANS = 10  # iterations, each of which doubles the digits; needed at the wire
 _WIRE = 1e-6  # of the radius, about; half the wire's thickness, so that the field stays finite
 
 
@@ -126,7 +126,7 @@ def _integrals(parameter: Array, complement: Array) -> tuple[Array, Array]:
     separate = 0.5 * parameter / (1.0 + complement)  # half the difference of the previous means
     added = 0.5 * separate / (1.0 + complement)  # its square over the parameter
     total, weight = added, 1.0
-    for _ in range(_MOST_MEANS):
+    for _ in range(_MAX_MEANS):
         if np.all(separate <= 1e-9 * mean):  # the next is its square
             break
         mean, other = 0.5 * (mean + other), np.sqrt(mean * other)

@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.units import MU0_OVER_4PI, Array
 
-_MIN_AZIMUTHS, _MOST_AZIMUTHS = 32, 4096
+_MIN_AZIMUTHS, _MAX_AZIMUTHS = 32, 4096
 _SLICES = 16
 _DIGITS = 26.0  # e-folds, eleven digits
 
@@ -71,7 +71,7 @@ def _azimuths(offset: Array, axis: Array, radius: float) -> int:
     rho = np.sqrt(np.maximum(square - (offset @ axis) ** 2, 0.0))
     rate = np.arccosh(np.maximum((square + radius**2) / (2.0 * radius * rho + 1e-300), 1.0))
     nearest = float(np.min(rate, initial=np.inf))
-    return int(np.clip(np.ceil(_DIGITS / max(nearest, 1e-3)), _MIN_AZIMUTHS, _MOST_AZIMUTHS))
+    return int(np.clip(np.ceil(_DIGITS / max(nearest, 1e-3)), _MIN_AZIMUTHS, _MAX_AZIMUTHS))
 
 
 def _slices(length: float | None) -> tuple[Array, Array]:

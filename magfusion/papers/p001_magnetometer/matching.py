@@ -22,7 +22,7 @@ from magfusion.estimation.snapshot.candidates import wahba
 from magfusion.units import DEGREE, Array, BoolArray
 
 UNDETERMINED = 10.0 * DEGREE  # rad, one sigma
-LEAST_SHARE = 0.05  # of the field across an axis; below it an error of the field grows twentyfold
+MIN_SHARE = 0.05  # of the field across an axis; below it an error of the field grows twentyfold
 RESTING = 0.05  # of gravity; a specific force that differs by more is not that of a body at rest
 
 THREE_ANGLES = (
@@ -106,7 +106,7 @@ def match_roll_pitch(
     along, _, down = _in_heading(yaw, field_world)
     size = float(np.linalg.norm(field_world))
     in_plane, rotated = np.hypot(along, down), np.arctan2(down, along)
-    if np.any(in_plane < LEAST_SHARE * size):
+    if np.any(in_plane < MIN_SHARE * size):
         raise InputError(
             "the field lies along the axis of pitch and cannot determine it; choose another"
             " heading, or add gravity from the accelerometer"
@@ -157,7 +157,7 @@ def roll_about(field_body: Array, pitch: Array, yaw: Array | float, field_world:
 def check_roll_axis(pitch: float, yaw: float, field_world: Array) -> None:
     """Raise InputError if the axis of roll lies along the field."""
     still = predict_field(np.array([0.0, pitch, yaw]), field_world)
-    if np.hypot(still[1], still[2]) < LEAST_SHARE * np.linalg.norm(field_world):
+    if np.hypot(still[1], still[2]) < MIN_SHARE * np.linalg.norm(field_world):
         raise InputError(
             "the field lies along the axis of roll and cannot determine it; choose another pitch or"
             " heading, or add gravity from the accelerometer"
@@ -194,7 +194,7 @@ def attitude_with_gravity(
     is vertical: then both are parallel.
     """
     direction = field_world / np.linalg.norm(field_world)
-    if np.hypot(direction[0], direction[1]) < LEAST_SHARE:
+    if np.hypot(direction[0], direction[1]) < MIN_SHARE:
         raise InputError(
             "the field is vertical, parallel to gravity, so that the yaw is not determined; give"
             " the yaw, or add beacons"

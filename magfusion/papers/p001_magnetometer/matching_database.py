@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from magfusion.errors import InputError
-from magfusion.files.attitude_table import LEAST_ENTRIES, Angles, AttitudeDatabase
+from magfusion.files.attitude_table import MIN_ENTRIES, Angles, AttitudeDatabase
 from magfusion.papers.p001_magnetometer.matching import (
-    LEAST_SHARE,
+    MIN_SHARE,
     THREE_ANGLES,
     Matches,
     check_roll_axis,
@@ -90,12 +90,12 @@ def build_database(
     else:
         side = fold_side(rpy[:, 1], rpy[:, 2], field_world)
         usual = 1.0 if np.sum(np.sign(side)) >= 0.0 else -1.0
-        beyond = usual * side < LEAST_SHARE
+        beyond = usual * side < MIN_SHARE
     thinned = _thin(field_body[~beyond], rpy[~beyond], step)
-    if len(thinned[0]) < LEAST_ENTRIES:
+    if len(thinned[0]) < MIN_ENTRIES:
         raise InputError(
             f"holds {len(thinned[0])} attitudes that differ by {step / DEGREE:g} degrees and do not"
-            f" lie beyond the fold; a database requires {LEAST_ENTRIES}; rotate the platform"
+            f" lie beyond the fold; a database requires {MIN_ENTRIES}; rotate the platform"
             " through all attitudes to be estimated"
         )
     return Built(AttitudeDatabase(*thinned, chosen, source), int(np.sum(beyond)))

@@ -37,7 +37,7 @@ from magfusion.papers.p004_fingerprints.rssi import (
 from magfusion.units import Array, IntArray
 
 Method = Literal["paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"]
-LEAST_BEACONS = 3  # a position has three coordinates
+MIN_BEACONS = 3  # a position has three coordinates
 BLOCK_ITERATIONS = 3  # between position and the block that it lies in
 
 TOO_FEW_BEACONS = "fewer than three beacons detected"
@@ -79,7 +79,7 @@ def fix_as_published(
     EstimationError where a trilateration does not converge.
     """
     detected = np.isfinite(fields.amplitude)
-    enough = np.sum(detected, axis=1) >= LEAST_BEACONS
+    enough = np.sum(detected, axis=1) >= MIN_BEACONS
     dropped = {TOO_FEW_BEACONS: int(np.sum(~enough)), TOO_FEW_POINTS: 0}
     position = np.full((len(detected), 3), np.nan)
     for pattern in np.unique(detected[enough], axis=0):

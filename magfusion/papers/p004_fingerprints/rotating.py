@@ -5,7 +5,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Beacon, Site
-from magfusion.papers.p004_fingerprints.algorithms import LEAST_BEACONS, RotatingFields
+from magfusion.papers.p004_fingerprints.algorithms import MIN_BEACONS, RotatingFields
 from magfusion.papers.p004_fingerprints.equations import eq_25_fingerprint
 from magfusion.papers.p004_fingerprints.fingerprint import (
     NEIGHBOURS,
@@ -27,9 +27,9 @@ def rotating_beacons(
     """Return the fingerprints of rotating beacons alone, and the axes about which these rotate."""
     axis = np.array([rotation_axis_world(b) for b in site.beacons if b.name in database.beacons])
     columns = np.flatnonzero(np.isfinite(axis).all(axis=1))
-    if len(columns) < LEAST_BEACONS:
+    if len(columns) < MIN_BEACONS:
         raise InputError(
-            f"the algorithms of paper 004 require {LEAST_BEACONS} rotating beacons, two coils on"
+            f"the algorithms of paper 004 require {MIN_BEACONS} rotating beacons, two coils on"
             f" one tone; site and survey share {len(columns)}; use --method likelihood, or add"
             " beacons"
         )
@@ -39,10 +39,10 @@ def rotating_beacons(
         database.position_world,
         database.amplitude[:, columns],
     )
-    useful = int(np.sum(np.sum(np.isfinite(kept.amplitude), axis=1) >= LEAST_BEACONS))
+    useful = int(np.sum(np.sum(np.isfinite(kept.amplitude), axis=1) >= MIN_BEACONS))
     if useful < NEIGHBOURS:
         raise InputError(
-            f"has {useful} points that detect {LEAST_BEACONS} rotating beacons; {NEIGHBOURS}"
+            f"has {useful} points that detect {MIN_BEACONS} rotating beacons; {NEIGHBOURS}"
             " are needed; survey more places"
         )
     return kept, axis[columns]

@@ -20,8 +20,8 @@ from magfusion.units import MU0_OVER_4PI, Array, IntArray
 
 ITERATIONS = 200  # a bound; ten suffice unless no position fits the ranges
 CONVERGED = 1e-10  # m; misfit by which the last step lowers it
-LEAST_POINTS = 4  # of a block's line
-LEAST_SPREAD = 0.1  # of the logarithms of their distances
+MIN_POINTS = 4  # of a block's line
+MIN_SPREAD = 0.1  # of the logarithms of their distances
 FLAT = 1e-9  # thickness of a plane, relative to its extent
 _TINY = 1e-12  # m
 
@@ -88,7 +88,7 @@ def fit_block_lines(
     for b, i in np.ndindex(slope.shape):
         here = (own.ravel() == b) & np.isfinite(amplitude[:, i])
         log_distance = np.log(distance[here, i])
-        if len(log_distance) >= LEAST_POINTS and np.ptp(log_distance) >= LEAST_SPREAD:
+        if len(log_distance) >= MIN_POINTS and np.ptp(log_distance) >= MIN_SPREAD:
             line = np.polyfit(log_distance, np.log(amplitude[here, i]), 1)
             slope[b, i], intercept[b, i] = line
     return BlockLines(size, overall, blocks, RssiLines(slope, intercept))

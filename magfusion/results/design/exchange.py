@@ -33,14 +33,14 @@ Objective = Literal["worst", "sigma", "D", "A"]
 LESS = 1e-4  # of the objective; an exchange that gains less is none
 FIRST_POINTS = 24  # compared from the start
 MORE_POINTS = 6  # added in a round, apart from each other
-MOST_COMPARED = 64  # points, for the memory that all candidates take there
+MAX_COMPARED = 64  # points, for the memory that all candidates take there
 ROUNDS = 8
 SWEEPS = 20
 POWER = 8  # of the mean of sigmas that stands for the worst one
 DRAWN = 30  # random layouts, of which the best is a start
 STAGES = (3, 8)  # points at which candidates are compared, before all
 AT_ONCE = 3000  # informations in memory at once
-MOST_KEPT = 10_000_000  # numbers of all candidates at all points that are kept in memory
+MAX_KEPT_NUMBERS = 10_000_000  # numbers of all candidates at all points that are kept in memory
 TRIES = 2000  # random layouts in a row that do not keep their distance
 
 
@@ -112,7 +112,7 @@ class LayoutSearch:
         """Roots of all candidates at all points; None where they are too many."""
         beacons, information = self.candidates.beacons, self.information
         size = information.root(beacons[0]).size
-        if len(beacons) * size > MOST_KEPT:
+        if len(beacons) * size > MAX_KEPT_NUMBERS:
             return None
         return np.stack([information.root(beacon) for beacon in beacons])
 
@@ -326,7 +326,7 @@ def _exchange_until_converged(search: LayoutSearch, layout: tuple[int, ...]) -> 
             best = ExchangeResult(layout, value, complete=True)
         reached = float(search_value(each, search.objective))
         enough = not _is_worst(search.objective) or reached <= search.value(layout) * (1.0 + LESS)
-        full = len(search.active) + MORE_POINTS > MOST_COMPARED
+        full = len(search.active) + MORE_POINTS > MAX_COMPARED
         if enough or full or not search.in_time():
             break
         search.add(_worst_apart(search, each))

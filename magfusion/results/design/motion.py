@@ -38,7 +38,7 @@ ATTITUDES_DEG = (
     (0.0, -90.0, 0.0),
     (180.0, 0.0, 0.0),
 )  # roll, pitch, yaw
-MOST_PLACES = 120
+MAX_PLACES = 120
 OUT_OF_REACH = 0.9  # of a sigma, that all stops together leave: no motion determines it
 LEVEL_SIGMA = 2e-3  # rad, of gravity, at the least
 UNKNOWN = 1e-4  # information (1/rad^2) of a phase of which nothing is known
@@ -157,7 +157,7 @@ def candidate_poses(
     site: Site, blocks: tuple[Block, ...], places: Array, stop: float, *, known: bool
 ) -> Poses:
     """Return every place in every attitude, with the information of a stop there."""
-    places = places[np.unique(np.linspace(0, len(places) - 1, MOST_PLACES).astype(int))]
+    places = places[np.unique(np.linspace(0, len(places) - 1, MAX_PLACES).astype(int))]
     centres = np.array([b.position_world for b in site.beacons])
     separate = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1)
     places = places[separate > NEAREST + np.linalg.norm(site.platform.magnetometer.position_body)]

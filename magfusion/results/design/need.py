@@ -14,7 +14,7 @@ from magfusion.results.design.turns import is_in_turn
 
 FIRST = 2  # beacons; one leaves positions open
 GROWTH = 1.5  # of the number, until it suffices
-LARGEST, SMALLEST = 30.0, 0.01  # factor on the template's moment
+MAX_FACTOR, MIN_FACTOR = 30.0, 0.01  # factor on the template's moment
 DIGITS = 2  # of a moment
 
 
@@ -88,9 +88,9 @@ def least_moment(needed: NeededDesign, need: float) -> NeededDesign:
     If no moment does, those of the design remain.
     """
     task, result = needed.task, needed.design
-    if worst_of(task, result, LARGEST) > need:
+    if worst_of(task, result, MAX_FACTOR) > need:
         return replace(needed, reached=False)
-    low, high = np.log(SMALLEST), np.log(LARGEST)
+    low, high = np.log(MIN_FACTOR), np.log(MAX_FACTOR)
     while high - low > 0.01:
         middle = 0.5 * (low + high)
         if worst_of(task, result, float(np.exp(middle))) <= need:

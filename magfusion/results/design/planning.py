@@ -35,7 +35,7 @@ from magfusion.results.design.turns import all_in_turn, in_turn, is_in_turn
 from magfusion.results.pose_information import NEAREST
 from magfusion.units import Array
 
-MOST_CANDIDATES = 6000
+MAX_CANDIDATES = 6000
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +156,10 @@ def candidates_of(task: Task, beacon: Beacon) -> Candidates:
             f" forbidden, closer than --clearance {task.clearance:g} m to the points of use, or"
             f" closer than --apart {task.min_distance:g} m to a beacon that stays"
         )
-    if len(places) * len(axes) > MOST_CANDIDATES:
+    if len(places) * len(axes) > MAX_CANDIDATES:
         raise InputError(
             f"{len(places)} mounting places in {len(axes)} directions are more than"
-            f" {MOST_CANDIDATES} candidates; choose a larger --grid, or fewer --axes"
+            f" {MAX_CANDIDATES} candidates; choose a larger --grid, or fewer --axes"
         )
     return Candidates(
         tuple(replace(rotated_to(beacon, axis), position_world=p) for p in places for axis in axes),

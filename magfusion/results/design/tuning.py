@@ -12,7 +12,7 @@ from magfusion.results.design.pattern import stronger, tuned
 from magfusion.units import Array
 
 STEPS = (0.2, 0.1, 0.05)  # of a beacon's even share, given from one to another
-LEAST_SHARE = 0.2  # of it, that a beacon keeps
+MIN_SHARE = 0.2  # of it, that a beacon keeps
 
 
 def divided(
@@ -41,7 +41,7 @@ def divided(
                 other = share.copy()
                 other[donor] -= step
                 other[recipient] += step
-                if other[donor] < LEAST_SHARE - 1e-9:
+                if other[donor] < MIN_SHARE - 1e-9:
                     continue
                 reached = value(other)
                 if reached < best - LESS * abs(best):

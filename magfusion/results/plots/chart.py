@@ -10,9 +10,9 @@ import numpy as np
 
 from magfusion.units import Array, IntArray
 
-MOST_POINTS = 1200  # of a line; more than a chart has pixels
+MAX_POINTS = 1200  # of a line; more than a chart has pixels
 _LEFT_MARGIN, _RIGHT, _TOP, _BOTTOM = 62.0, 10.0, 26.0, 38.0  # pixels around the axes
-_SMALLEST = 1e-300
+_MIN_POSITIVE = 1e-300
 
 
 class ChartLine(NamedTuple):
@@ -114,9 +114,9 @@ def ticks(low: float, high: float, maximum: int = 6) -> list[float]:
 def thinned(y: Array) -> IntArray:
     """Return the rows of a line to draw: the minimum and maximum of each stretch."""
     n = len(y)
-    if n <= MOST_POINTS:
+    if n <= MAX_POINTS:
         return np.arange(n)
-    edges = np.linspace(0, n, MOST_POINTS // 2 + 1).astype(np.int64)
+    edges = np.linspace(0, n, MAX_POINTS // 2 + 1).astype(np.int64)
     chosen = {0, n - 1}
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         piece = y[begin:end]
@@ -129,7 +129,7 @@ def thinned(y: Array) -> IntArray:
 
 def _logarithmic(chart: Chart) -> Chart:
     def selected(y: Array) -> Array:
-        return np.log10(np.where(y > 0.0, np.maximum(y, _SMALLEST), np.nan))
+        return np.log10(np.where(y > 0.0, np.maximum(y, _MIN_POSITIVE), np.nan))
 
     lines = tuple(line._replace(y=selected(line.y)) for line in chart.lines)
     bands = tuple(b._replace(low=selected(b.low), high=selected(b.high)) for b in chart.bands)

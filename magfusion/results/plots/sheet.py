@@ -21,7 +21,7 @@ PLAN = (10.3, 5.6)  # inches for the plan
 INCH = 0.0254  # m
 SCALES = (10, 20, 50, 100, 200, 250, 300, 400, 500, 1000, 2000, 5000, 10_000, 100_000)
 DETAILED = 100  # scale of the pages of parts, where the whole has a smaller one
-MOST_PARTS = 12
+MAX_PARTS = 12
 ROWS = 24  # of a table on a page
 TOLERANCE = 2.0  # sigmas
 
@@ -156,7 +156,7 @@ def _plans(
         return
     part = np.array(PLAN) * INCH * DETAILED
     count = np.ceil(np.ptp(hall.room.polygon, axis=0) / part).astype(int)
-    if np.prod(count) > MOST_PARTS:
+    if np.prod(count) > MAX_PARTS:
         return
     step = np.ptp(hall.room.polygon, axis=0) / count
     middle = hall.room.box_world[0, :2] + 0.5 * step

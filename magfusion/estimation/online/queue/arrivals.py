@@ -38,10 +38,10 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array, IntArray
 
-LONGEST_WAIT = 5.0  # s; fields are processed without an IMU that is silent for longer
-SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
+MAX_WAIT = 5.0  # s; fields are processed without an IMU that is silent for longer
+MIN_STEP = 1e-6  # s; of epochs of one magnetometer
 MARGIN = 0.1  # s; of inertial samples about a window
-LONGEST_RECORD = 0.1  # s; of samples that arrive together, twice what a replay sends at once
+MAX_RECORD = 0.1  # s; of samples that arrive together, twice what a replay sends at once
 
 
 class Arrivals(ABC):
@@ -125,7 +125,7 @@ class Arrivals(ABC):
         samples = sensor_frame_phasors(self.site, samples)
         check_clock("fields", samples.time, self.newest)
         # Phasors arrive when their window ends, with the samples of a record.
-        latency = samples.window / 2.0 + LONGEST_RECORD
+        latency = samples.window / 2.0 + MAX_RECORD
         self.fields_latency = float(np.max(latency, initial=self.fields_latency))
         late = self._add_epochs(samples, static, after)
         self.fields.sort(key=lambda s: float(s.time[0]))
@@ -186,7 +186,7 @@ class Arrivals(ABC):
     @property
     def awaited(self) -> float:
         """Time until which inertial samples have arrived, or are not awaited any more (s)."""
-        return max(self.imu.reached, self._newest_field - LONGEST_WAIT)
+        return max(self.imu.reached, self._newest_field - MAX_WAIT)
 
     def due(self, inertial: float) -> bool:
         """Return whether phasors are due for processing, up to a time of the IMU (s)."""
@@ -371,4 +371,4 @@ class Arrivals(ABC):
         names = dict.fromkeys(name for name, there in named if there)
         steps = [time - self._last_sample_times.get(name, -np.inf) for name in names]
         self._last_sample_times |= dict.fromkeys(names, time)
-        return max(min(steps, default=np.inf), SHORTEST_STEP)
+        return max(min(steps, default=np.inf), MIN_STEP)

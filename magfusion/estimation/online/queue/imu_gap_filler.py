@@ -9,7 +9,7 @@ from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.receiver.admission import Admission, longest_step, silences
 from magfusion.units import Array
 
-LONGEST = 2.0  # s; that is filled from a known state
+MAX_GAP = 2.0  # s; that is filled from a known state
 REACH = 0.5  # s; of inertial samples about a stretch, to detect a gap
 
 
@@ -50,7 +50,7 @@ class ImuGapFiller:
         within = (time > state.time) & (time < until)
         kept = self.time <= state.time - offset
         self.time, self.rows = self.time[kept], self.rows[kept]
-        if until - state.time > LONGEST:
+        if until - state.time > MAX_GAP:
             return
         inertial = ImuSamples(stamps + offset, detected[:, :3], detected[:, 3:])
         part, step = Waveform(time[within], rows[within]), admission.imu_step

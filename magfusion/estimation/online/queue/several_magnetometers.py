@@ -17,7 +17,7 @@ from magfusion.estimation.demodulation.several_demodulation import same_windows
 from magfusion.estimation.demodulation.temperature_compensation import refuse_warm
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
-from magfusion.estimation.online.queue.arrivals import LONGEST_WAIT, MARGIN, Arrivals
+from magfusion.estimation.online.queue.arrivals import MARGIN, MAX_WAIT, Arrivals
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
@@ -145,7 +145,7 @@ class SeveralArrivals(Arrivals):
             return -np.inf
         detected, silent = self._last_times(), self._silent()
         waited = min(to for name, to in detected.items() if name not in silent)
-        return max(waited, self.imu.reached - LONGEST_WAIT)
+        return max(waited, self.imu.reached - MAX_WAIT)
 
     def _silent(self) -> list[str]:
         """Return the magnetometers that are not awaited."""

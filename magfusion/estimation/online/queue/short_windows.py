@@ -16,7 +16,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.joint import JointReceiver, joint_settings
 from magfusion.receiver.turn import on_clock
-from magfusion.receiver.windows import LONGEST_WINDOW, LockinSettings
+from magfusion.receiver.windows import MAX_WINDOW, LockinSettings
 from magfusion.units import Array
 
 
@@ -102,7 +102,7 @@ class ShortWindows:
         calibration = predicted.calibration
         centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
         wanted = predicted.time + receiver.nodes
-        off = taken_off(samples, path, imu, calibration, offset, LONGEST_WINDOW, wanted)
+        off = taken_off(samples, path, imu, calibration, offset, MAX_WINDOW, wanted)
         assert off.wanted is not None
         result, shown = joint_phasors(
             receiver.designs,
@@ -135,7 +135,7 @@ def _foreseen(joint: JointPhasors, state: State, length: float) -> FieldSamples:
     parts = np.concatenate([phasor.real, phasor.imag], axis=-1)[0]
     square = np.sum((by @ parts[..., None])[..., 0] ** 2, axis=1)
     information = np.sum(by**2, axis=(1, 2)) / 6.0
-    strong = square * (LONGEST_WINDOW / length) > DETECTION_CHI_SQUARE_ONLINE
+    strong = square * (MAX_WINDOW / length) > DETECTION_CHI_SQUARE_ONLINE
     detected = joint.is_predicted[0] & strong & (information > 0.0)
     variance = np.where(detected, 1.0 / np.where(detected, information, 1.0), 1.0)
     return FieldSamples(

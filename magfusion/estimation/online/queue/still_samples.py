@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magfusion.model.without_imu import LONGEST_STEP, STEPS
+from magfusion.model.without_imu import MAX_STEP, STEPS
 from magfusion.units import Array
 
 
@@ -29,8 +29,8 @@ class StillSamples:
             return np.zeros(0)
         newest = float(np.max(time))
         if not known:
-            shortest = LONGEST_STEP if raw else float(np.median(np.diff(time))) / STEPS
-            self.step = min(LONGEST_STEP, shortest)
+            shortest = MAX_STEP if raw else float(np.median(np.diff(time))) / STEPS
+            self.step = min(MAX_STEP, shortest)
             self.until = float(np.min(time)) - self.step
         count = int(np.ceil((newest - self.until) / self.step)) + 1
         if newest <= self.until or count < 1:
