@@ -374,8 +374,8 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
     if off > MAX_UNNORMALIZED_SHARE * (counts.written + off):
         raise InputError(
             f"{place}: {off} of {counts.read} quaternions are more than"
-            f" {100.0 * MAX_LENGTH_ERROR:.0f} % off unit length: map other columns, or scale them if they"
-            " are rotations."
+            f" {100.0 * MAX_LENGTH_ERROR:.0f} % off unit length: map other columns, or scale them"
+            " if they are rotations."
         )
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MAX_DUPLICATED * (counts.written + twice):
