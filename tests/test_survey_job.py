@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.files.log import read_log
 from magfusion.files.survey import Survey, read_survey
-from magfusion.jobs.inputs import read_estimate
+from magfusion.jobs.inputs import known_poses, read_estimate
 from magfusion.jobs.survey import make_survey
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -377,6 +377,24 @@ def test_a_log_without_truth_asks_for_a_trajectory(
 ) -> None:
     (log / "truth.parquet").unlink()
     assert "--trajectory" in refuse("survey", log, "-o", tmp_path / "survey")
+
+
+def test_a_row_of_the_trajectory_that_is_lost_or_double_is_a_finding(tmp_path: Path) -> None:
+    poses, log = _stop_and_go()
+    rows = [*range(10), *range(9, len(poses.time))]  # one is double
+    quaternion = Rotation.from_matrix(poses.world_from_body[rows]).as_quat(scalar_first=True)
+    columns = np.column_stack([poses.position_world[rows], quaternion])
+    columns[20, 0] = np.nan
+    names = ("position_x", "position_y", "position_z", "qw", "qx", "qy", "qz")
+    stamps = np.round(1e9 * poses.time[rows]).astype(np.int64)
+    table = {"time_ns": stamps} | dict(zip(names, columns.T, strict=True))
+    path = tmp_path / "trajectory.parquet"
+    pyarrow.parquet.write_table(pyarrow.table(table), path)
+    result, told = known_poses(log, tmp_path, path)
+    assert len(result.time) == len(poses.time) - 1
+    texts = [finding.text for finding in told.findings]
+    assert any("1 sample is an exact copy of another" in text for text in texts)
+    assert any("1 without a pose" in text for text in texts)
 
 
 def test_other_files_are_not_replaced(worked: Worked, tmp_path: Path, refuse: Refuse) -> None:

@@ -23,7 +23,11 @@ def copied_rows(time_ns: IntArray, values: Array) -> BoolArray:
 
 def copies_text(name: str, copies: BoolArray) -> str:
     """Return how many rows of a stream or file are left out as they were written twice."""
-    return f"{name}: {np.sum(copies)} samples are exact copies of others. They are left out."
+    count = int(np.sum(copies))
+    what = f"{count} samples are exact copies of others. They are left out."
+    return (
+        f"{name}: {'1 sample is an exact copy of another. It is left out.' if count == 1 else what}"
+    )
 
 
 def coarse_text(place: str, stream: str, twice: int, count: int) -> str:

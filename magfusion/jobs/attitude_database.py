@@ -15,7 +15,6 @@ from magfusion.files.attitude_table import write_database
 from magfusion.jobs.settings import Command, LogSettings, Settings, option
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p001_magnetometer.matching import predict_field
@@ -26,7 +25,7 @@ from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
-    from magfusion.jobs.inputs import Job
+    pass
 
 
 TABLE = "attitudes.parquet"
@@ -82,19 +81,20 @@ class Steady(NamedTuple):
 
 def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     """Build the database of a log with known attitudes: table, picture and report."""
-    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.inputs import known_poses, named, read_job
     from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.match import write_database_plot
 
     job, claimed = settings.job(output), claim(output, "calibrate attitude-database")
     log, site = read_job(job)
-    reference, place = _reference(job, log, settings.trajectory)
+    reference, log = known_poses(log, job.log_path, settings.trajectory)
     with named(job.log_path):
         result = steady(log, site, settings)
     poses, known, reason = truth_poses(reference, result.time)
     if not np.any(known):
         raise InputError(
-            f"{place}: does not cover the magnetometer's times: {reason}; give another"
+            f"{settings.trajectory or job.log_path}: does not cover the magnetometer's times:"
+            f" {reason}; give another"
         )
     with named(job.log_path):
         built = build_database(
@@ -158,18 +158,6 @@ def judge_database(index: Index, site: Site, log: Log) -> Trust:
             )
             result.append(Finding("earth_field", text, Verdict.FAILED, off / CONTRADICTED))
     return Trust(tuple(result))
-
-
-def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory, Path]:
-    from magfusion.jobs.inputs import read_estimate, whole_poses
-
-    if trajectory is not None:
-        return read_estimate(trajectory, log.epoch_ns), trajectory
-    if log.truth is None:
-        raise InputError(
-            f"{job.log_path}: has no truth; give the result of magfusion smooth with --trajectory"
-        )
-    return whole_poses(log.truth, job.log_path), job.log_path
 
 
 def steady(log: Log, site: Site, sampling: Sampling) -> Steady:

@@ -140,21 +140,14 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
 
 
 def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Finding, ...]]:
-    from magfusion.jobs.inputs import Job, named, read_estimate, read_job, whole_poses
+    from magfusion.jobs.inputs import Job, known_poses, named, read_job
     from magfusion.results.report import dropped_figures
 
     site_path, result = settings.site, settings.trajectory
     if site_path is None and result is not None and (result / "site.yaml").is_file():
         site_path = result / "site.yaml"
     log, site = read_job(Job(settings.source, site_path, Path()))
-    if result is not None:
-        poses = read_estimate(result, log.epoch_ns)
-    elif log.truth is not None:
-        poses = whole_poses(log.truth, settings.source)
-    else:
-        raise InputError(
-            f"{settings.source}: has no truth; smooth it and give the result with --trajectory RUN"
-        )
+    poses, log = known_poses(log, settings.source, result)
     with named(settings.source):
         samples, dropped = _samples(log, site, poses)
     there, exists = interpolate(poses, samples.time, MAX_GAP)

@@ -276,6 +276,24 @@ def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
     return poses
 
 
+def known_poses(log: Log, place: Path, trajectory: Path | None) -> tuple[Trajectory, Log]:
+    """Return the poses of a trajectory for a log, or those of its truth, and the log.
+
+    The log's findings include what was left out of the trajectory. Raises InputError where there
+    are no poses, or positions or attitudes alone.
+    """
+    if trajectory is None and log.truth is None:
+        raise InputError(
+            f"{place}: has no truth for the poses; give a smoothed result with --trajectory"
+        )
+    if trajectory is None:
+        assert log.truth is not None
+        return whole_poses(log.truth, place), log
+    findings: list[Finding] = []
+    poses = whole_poses(read_any_poses(trajectory, log.epoch_ns, findings), trajectory)
+    return poses, replace(log, findings=(*log.findings, *findings))
+
+
 def read_any_poses(
     path: Path, epoch_ns: int = 0, findings: list[Finding] | None = None
 ) -> Trajectory:

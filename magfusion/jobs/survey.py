@@ -23,7 +23,7 @@ from magfusion.results.verdict import trust_figures
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 if TYPE_CHECKING:
-    from magfusion.jobs.inputs import Job
+    pass
 
 
 Points = Literal["rests", "epochs"]
@@ -53,7 +53,7 @@ class _Point(NamedTuple):
 def run_survey(settings: SurveySettings, output: Path) -> Figures:
     """Make a survey of the fields at known poses: table, picture and report."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.inputs import known_poses, named, read_job
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.survey import write_survey_plot
     from magfusion.results.report import dropped_figures, write_report
@@ -61,7 +61,7 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
     job, claimed = settings.job(output), claim(output, "survey")
     lockin = settings.lockin(job)
     log, site = read_job(job)
-    poses = _poses(job, settings, log)
+    poses, log = known_poses(log, job.log_path, settings.trajectory)
     with named(job.log_path):
         slots, windows_dropped = phasors(log, site, lockin)
     samples, _ = fix_inputs(slots, log, site)  # of coils driven in turn whole cycles
@@ -80,18 +80,6 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
         write_survey_plot(directory / "survey.png", site, survey)
         write_report(directory, figures)
     return figures
-
-
-def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
-    from magfusion.jobs.inputs import read_estimate, whole_poses
-
-    if settings.trajectory is not None:
-        return read_estimate(settings.trajectory, log.epoch_ns)
-    if log.truth is None:
-        raise InputError(
-            f"{job.log_path}: has no truth for the poses; give a smoothed result with --trajectory"
-        )
-    return whole_poses(log.truth, job.log_path)
 
 
 def make_survey(
