@@ -58,7 +58,7 @@ ROOMS = {
             long_log
         """,
         "receiver": """
-            ambient bursts cells ellipse even_samples false_runs host_clock hum noise range_ends
+            ambient bursts cells ellipse even_samples false_samples host_clock hum noise range_ends
             rotor rotor_phase sampling_clock turn windows
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing

@@ -22,7 +22,7 @@ from magfusion.files.plausible import declared_range, reaches
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.false_runs import MAX_RUN, false_runs
+from magfusion.receiver.false_samples import MAX_RUN, deviations, false_runs
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -39,9 +39,6 @@ MIN_AT_LIMIT, MIN_RUN = 12, 3  # samples at a limit, and of them in a row, at le
 SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
 MAX_PASSES = 8
 MIN_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
-# Deviations over the differences of the neighbours, and of all but an outer one that may be false.
-AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
-EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 AXES = "xyz"
 
@@ -277,57 +274,6 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     size = own.size(np.maximum(_scatter(own.residual), step_of_axes(x)))
     rows = np.flatnonzero(size > SPIKE)
     return rows, size[rows] > CERTAIN_SPIKE
-
-
-class Deviations(NamedTuple):
-    """Deviations of samples from their neighbours."""
-
-    off: Array  # (n, axes), zero where the neighbours do not agree with each other
-    # (n, axes), from the cubic through the neighbours, of noise as if they were even
-    residual: Array
-    widening: Array  # (n, 1), how much larger it may be where they are not
-    centre: Array  # (n, axes), mean of the nearest neighbours
-
-    def size(self, scatter: Array) -> Array:
-        """Return deviations relative to the scatter of residuals, the largest axis, shape (n,)."""
-        usual = self.widening * scatter + 1e-9 * np.abs(self.centre)  # rounding
-        return np.asarray(np.max(self.off / np.maximum(usual, np.finfo(float).tiny), axis=1))
-
-
-def deviations(time: Array, x: Array, step: float) -> Deviations:
-    """Return deviations of samples (n, axes), at least five, at times (s) with a usual step."""
-    row = np.arange(len(x))
-    first = np.clip(row - 2, 0, len(x) - 5)
-    near = [first + k + (first + k >= row) for k in range(4)]
-    weight, noise, widening = _cubic(time, near, step)
-    curve = np.zeros_like(x)
-    for own, at in zip(weight, near, strict=True):
-        curve += own[:, None] * x[at]
-    before, after = x[near[1]], x[near[2]]
-    centre = 0.5 * (before + after)
-    outer = np.abs(x[near[0]] - centre), np.abs(x[near[3]] - centre)
-    separate = np.maximum(np.abs(after - before), np.maximum(*outer))
-    others = np.maximum(np.abs(after - before), np.minimum(*outer))
-    from_curve = np.abs(x - curve)
-    off = np.minimum(from_curve, np.abs(x - centre))
-    alone = (off > AGREEMENT * separate) | (off > AGREEMENT_BUT_ONE * others)
-    return Deviations(np.where(alone, off, 0.0), from_curve / noise, widening, centre)
-
-
-def _cubic(time: Array, near: list[IntArray], step: float) -> tuple[list[Array], Array, Array]:
-    """Return weights (n,) of four neighbours in a cubic, and how much its error grows.
-
-    The latter, shape (n, 1), is relative to even samples: of noise alone, and of noise or a smooth
-    signal where samples are missing or at an end.
-    """
-    far = [(time[at] - time) / step for at in near]
-    weight = []
-    for k, own in enumerate(far):
-        others = [far[j] for j in range(4) if j != k]
-        weight.append(np.prod([other / (other - own) for other in others], axis=0))
-    noise = np.sqrt(1.0 + np.sum(np.square(weight), axis=0))[:, None] / EVEN_GAIN
-    smooth = np.abs(np.prod(far, axis=0))[:, None] / 4.0
-    return weight, noise, np.maximum(1.0, np.maximum(noise, smooth))
 
 
 def _scatter(off: Array) -> Array:

@@ -10,11 +10,10 @@ from magfusion.estimation.data_checks.samples import (
     SPIKE,
     InstrumentStream,
     are_few,
-    deviations,
     is_predictable,
 )
 from magfusion.model.site import Site
-from magfusion.receiver.false_runs import false_runs
+from magfusion.receiver.false_samples import deviations, false_runs
 from magfusion.units import Array, BoolArray
 
 REACH = 2  # samples after one that its test needs, and as many before
