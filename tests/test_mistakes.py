@@ -129,6 +129,8 @@ def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
         ("ekf", ("epoch_12ms", "magnetometer_50ms_late", "drives_free_running")),
         ("smooth", ("magnetometer_xy_swapped", "magnetometer_z_sign", "imu_clock_1000ppm")),
         ("ekf", ("magnetometer_xy_swapped", "magnetometer_z_sign")),
+        # A common drift of all drives is their frequencies or the magnetometer's clock.
+        ("smooth", ("frequencies_200ppm", "magnetometer_clock_1000ppm")),
     ],
 )
 def test_units_signs_biases_and_frames_are_undone_and_their_remedies_work(

@@ -7,6 +7,7 @@ gives is the one with which this result was made.
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.correction import (
+    MAX_SOLUTIONS,
     Correction,
     Trial,
     as_estimated,
@@ -63,4 +64,7 @@ def corrected(
         return Trial(done, len(done.trust.reasons) == 1, nearly, done.continued)
 
     # What no key of the site's file describes cannot be corrected.
-    return best_trial((one for one in possible if changed_keys(site, one.site)), tried)
+    known = [one for one in possible if changed_keys(site, one.site)]
+    # A whole log decides between a correction that is refined and its rival.
+    has_rival = any(one.alternative is not None for one in known)
+    return best_trial(known, tried, MAX_SOLUTIONS + has_rival)

@@ -171,15 +171,18 @@ def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
 
 
 def best_trial(
-    possible: Iterable[Correction], tried: Callable[[Correction], Trial[T] | None]
+    possible: Iterable[Correction],
+    tried: Callable[[Correction], Trial[T] | None],
+    maximum: int = MAX_SOLUTIONS,
 ) -> T | None:
     """Return the result by the correction that explains a log; None where none does.
 
     `possible`: the most likely first; a remainder, or a rival of what is contradicted, comes before
-    others. `tried`: returns the trial of a correction, None where it has no solution.
+    others. `tried`: returns the trial of a correction, None where it has no solution. `maximum`:
+    number of trials.
     """
     waiting, best, continues = list(possible), None, False
-    for _ in range(MAX_SOLUTIONS):
+    for _ in range(maximum):
         if not waiting:
             break
         correction = waiting.pop(0)

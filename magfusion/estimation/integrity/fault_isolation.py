@@ -123,7 +123,8 @@ def diagnosed(
         return None
     if one.rival is None:
         return known
-    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), *parts, several=several)
+    of = OF_MOTION if text == one.text(OF_MOTION) else "the fields"
+    rival = _diagnosis(one.rival, one.rival.text(of), *parts, several=several)
     return known._replace(rival=rival, rival_probability=one.rival_probability)
 
 

@@ -19,7 +19,7 @@ from magfusion.estimation.integrity.beacon_causes import (
 )
 from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import ENOUGH, MARGIN, Explanation, clearly_best
-from magfusion.estimation.integrity.fault_candidates import EPOCH_SHIFT
+from magfusion.estimation.integrity.fault_candidates import EPOCH_SHIFT, SAMPLE_RATE
 from magfusion.estimation.integrity.field_causes import global_causes
 from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
 from magfusion.estimation.integrity.motion_causes import (
@@ -45,6 +45,7 @@ MAX_DURATION = 100.0  # s; of a longer log parts are tried
 PARTS = 4
 MIN_EPOCHS = 8  # epochs
 MIN_TRAVEL = 0.3  # m; who goes less far sees each beacon from one side
+MIN_SPAN = 20.0  # s; in less, other rates of clocks are not refuted by what they lead to
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
 QUANTISED, LEFT_HANDED = "quantised", "magnetometer_axes"  # codes
 DISTORTION = 0.3  # of a step, in phasors: 1/sqrt(12) of each sample
@@ -78,8 +79,8 @@ def cause_of(
         return of_motion, of_motion.text(OF_MOTION)
     if of_fields is not None and of_fields.code == LEFT_HANDED:
         of_fields = replace(of_fields, site=_with_right_axes(samples, part.imu, site))
-    if of_fields is not None and of_fields.code == EPOCH_SHIFT:
-        of_fields = _delayed(of_fields, samples, part.imu)
+    if of_fields is not None and of_fields.code in (EPOCH_SHIFT, SAMPLE_RATE):
+        of_fields = _on_a_clock(of_fields, site, samples, part.imu)
     if of_fields is not None:
         return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
     return None
@@ -225,22 +226,37 @@ def _with_right_axes(samples: FieldSamples, imu: ImuSamples, site: Site) -> Site
     return None if motion is None else with_quarter_turn(motion, reversed_axes)
 
 
-def _delayed(shifted: Explanation, samples: FieldSamples, imu: ImuSamples) -> Explanation:
-    """Return a shift of all stamps, or its rival, of the magnetometer's, as the motion has it."""
-    site, rival = shifted.site, shifted.rival
-    if site is None or rival is None or rival.site is None:
-        return shifted
-    known, other = (one.platform.magnetometer.clock_offset for one in (site, rival.site))
-    every = surveyed(samples, initial_calibration(site, float(np.mean(samples.time))))
-    squares = []
-    for late in (0.0, other - known):
-        motion = compared(every, imu, site, late=late)
+def _on_a_clock(
+    clocked: Explanation, declared: Site, samples: FieldSamples, imu: ImuSamples
+) -> Explanation:
+    """Return what explains the phases, or its rival, whose magnetometer has another clock.
+
+    As the motion has it, which compares the magnetometer with the inertial sensor.
+    """
+    if clocked.site is None or clocked.rival is None or clocked.rival.site is None:
+        return clocked
+    before, squares = declared.platform.magnetometer, []
+    ahead = (1.0 + clocked.site.platform.magnetometer.clock_rate) / (1.0 + before.clock_rate) - 1.0
+    tones_hz = np.concatenate([beacon.tone_frequencies_hz for beacon in declared.beacons])
+    turn = 2.0 * np.pi * ahead * tones_hz * samples.time[:, None]
+    still = replace(samples, phasor_sensor=samples.phasor_sensor * np.exp(-1j * turn)[..., None])
+    every = surveyed(still, initial_calibration(clocked.site, float(np.mean(samples.time))))
+    for site in (clocked.site, clocked.rival.site):
+        own = site.platform.magnetometer
+        rate = (1.0 + own.clock_rate) / (1.0 + before.clock_rate)
+        time = (imu.time - (own.clock_offset - before.clock_offset)) / rate
+        motion = compared(every, replace(imu, time=time), site)
         if motion is None:
-            return shifted
+            return clocked
         squares.append(motion.explained(EYE, EYE)[0])
-    if squares[0] < squares[1] + MARGIN:
-        return shifted
-    return replace(rival, rival=replace(shifted, rival=None))
+    if squares[0] > squares[1] + MARGIN:
+        return replace(clocked.rival, rival=replace(clocked, rival=None))
+    if clocked.code == EPOCH_SHIFT:
+        return clocked
+    # In a few seconds neither rate is refuted, nor what follows from it.
+    is_short = samples.time[-1] - samples.time[0] < MIN_SPAN
+    is_refuted = squares[1] > squares[0] + MARGIN
+    return replace(clocked, rival=None) if is_short or is_refuted else clocked
 
 
 def _part(log: Log) -> Log:

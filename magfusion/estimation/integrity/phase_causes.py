@@ -92,7 +92,8 @@ def _of_each(known: Snapshots, constant: Snapshots, phase: Array) -> Explanation
         + ("" if is_one else ": the drives have no common clock"),
         "Check phase_deg, or declare synchronised: false for the beacons.",
     )
-    return replace(result, site=_free_running(known.site, dict.fromkeys(names or every, 0.0)))
+    rates = dict.fromkeys(names or every, 0.0)
+    return replace(result, site=_at_rates(known.site, rates, synchronised=False))
 
 
 def _wired(known: Snapshots, phase: Array) -> bool:
@@ -179,9 +180,18 @@ def _of_clocks(
     names = [name for name, _ in known.samples.channels]
     usual = max(float(np.median(np.abs(rate))), STILL)
     strays = [n for n, r in zip(names, rate, strict=True) if abs(r) > 10.0 * usual]
-    beacon, site = "", None
+    beacon, site, rival = "", None, None
+    explained = known.chi_square, tried.chi_square, known.freedom
     if np.all(is_common):
         code, count = "sample_rate", 2
+        rival = Explanation(
+            "beacon_clock",
+            f"the drives run {1e6 * common:+.4g} ppm off their declared frequencies",
+            "Correct frequency_hz of the beacons.",
+            *explained,
+            count,
+            site=_at_rates(known.site, dict.fromkeys(names, common), synchronised=True),
+        )
         slower = (1.0 + known.site.platform.magnetometer.clock_rate) * (1.0 + common) - 1.0
         if not known.site.platform.further:
             site = with_magnetometer(known.site, clock_rate=slower)
@@ -192,20 +202,19 @@ def _of_clocks(
         beacon, k = strays[0], names.index(strays[0])
         cause = f"beacon {strays[0]} runs at {tones_hz[k] * (1.0 + rate[k]):.6g} Hz"
         remedy = "Correct its frequency_hz, or declare synchronised: false."
-        site = _free_running(known.site, {beacon: float(rate[k])})
+        site = _at_rates(known.site, {beacon: float(rate[k])}, synchronised=False)
     else:
         code, count = "beacon_clock", 2 * len(rate)
         cause = "the drives run on clocks of their own"
         remedy = "Declare synchronised: false for the beacons."
-        site = _free_running(known.site, dict.fromkeys(names, 0.0))
-    explained = known.chi_square, tried.chi_square, known.freedom
-    yield Explanation(code, cause, remedy, *explained, count, beacon, site=site)
+        site = _at_rates(known.site, dict.fromkeys(names, 0.0), synchronised=False)
+    yield Explanation(code, cause, remedy, *explained, count, beacon, site=site, rival=rival)
 
 
-def _free_running(site: Site, rates: Mapping[str, float]) -> Site:
-    """Return a site with beacons on clocks of their own, at relative rates, by name."""
+def _at_rates(site: Site, rates: Mapping[str, float], *, synchronised: bool) -> Site:
+    """Return a site with frequencies of beacons off by relative rates, by name."""
 
-    def on_own_clock(beacon: Beacon) -> Beacon:
+    def at_rate(beacon: Beacon) -> Beacon:
         faster = 1.0 + rates[beacon.name]
         coils = (
             coil
@@ -214,9 +223,14 @@ def _free_running(site: Site, rates: Mapping[str, float]) -> Site:
             for coil in beacon.coils
         )
         frequency_hz = faster * beacon.frequency_hz
-        return replace(beacon, synchronised=False, frequency_hz=frequency_hz, coils=tuple(coils))
+        return replace(
+            beacon,
+            synchronised=synchronised and beacon.synchronised,
+            frequency_hz=frequency_hz,
+            coils=tuple(coils),
+        )
 
-    beacons = (on_own_clock(beacon) if beacon.name in rates else beacon for beacon in site.beacons)
+    beacons = (at_rate(beacon) if beacon.name in rates else beacon for beacon in site.beacons)
     return replace(site, beacons=tuple(beacons))
 
 
