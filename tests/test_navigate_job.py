@@ -1,6 +1,7 @@
 """magfusion navigate along a log: what it writes, tells and refuses."""
 
 import json
+import resource
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -77,7 +78,8 @@ def test_the_report_tells_errors_losses_latency_and_memory(smoothed: Path, worke
     assert figures["attitude_rmse_deg"] < 0.4
     assert figures["lagged_ate_m"] < 0.008
     assert 0.0 < figures["update_p50_ms"] <= figures["update_p99_ms"] <= figures["update_max_ms"]
-    assert 50.0 < figures["memory_mb"] < 4000.0
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # with earlier tests
+    assert 50.0 < figures["memory_mb"] <= peak_mb
     assert figures["first_state_s"] < 7.0
     for beacon in load_site(worked.log / "site.yaml").beacons:
         assert 0.0 < figures[f"distortion_{beacon.name}"] < 3.0
